@@ -1,0 +1,59 @@
+"""The hot kernel in eager torch: the default and the reference; autograd flows through it.
+
+`linearize` never keeps the Jacobian: rows are built, weighted and contracted chunk by chunk into one 9 x 9 matrix
+`S W S^T` per pair, where the ninth row is the residual. The chunk is small enough for its rows to stay in the cache.
+"""
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from torchvo360.residuals.normal import NormalEquations
+from torchvo360.residuals.direct import Reference, Target, by_rho, look_up, system_rows
+from torchvo360.residuals.weights import LossConfig, depth_variance_weight, robust
+
+CHUNK_SAMPLES = 49152
+"""Samples in one go; measured fastest between 32768 and 65536 on a core with 1 MB of L2 cache."""
+
+
+def linearize(
+    reference: Reference,
+    target: Target,
+    T_tgt_ref: Float[Tensor, "B 4 4"],
+    affine: Float[Tensor, "B 2"],
+    loss: LossConfig,
+    *,
+    noise: float = 4 / 255,
+) -> NormalEquations:
+    """Linearise the direct alignment of every pair at its own pose and brightness.
+
+    Args:
+        reference: Points of the reference frames.
+        target: Target images.
+        T_tgt_ref: Poses, float64.
+        affine: (a, b) of each pair, float64.
+        loss: The robust loss.
+        noise: Standard deviation of an intensity, for the weights of points with a variance.
+    """
+    B, N = reference.rho.shape
+    C = reference.value.shape[1]
+    dtype = reference.value.dtype
+    T, ab = T_tgt_ref.to(dtype), affine.to(dtype)
+    size = max(256, CHUNK_SAMPLES // (B * C))
+    M = T_tgt_ref.new_zeros(B, 9, 9)
+    cost, total = T_tgt_ref.new_zeros(B), T_tgt_ref.new_zeros(B)
+    for start in range(0, N, size):
+        points = reference.chunk(start, min(start + size, N))
+        samples = look_up(points, target, T, ab)
+        weight, residual = samples.weight, samples.residual
+        if points.variance is not None:
+            by_depth = depth_variance_weight(by_rho(samples, T[:, :3, 3]), points.variance[:, None], noise)
+            robust_weight, robust_cost = robust(residual * by_depth.sqrt(), loss)
+            robust_weight = robust_weight * by_depth
+        else:
+            robust_weight, robust_cost = robust(residual, loss)
+        S = system_rows(samples, (weight * robust_weight).sqrt())
+        M = M + torch.bmm(S, S.mT)
+        cost = cost + (weight * robust_cost).sum((1, 2))
+        total = total + weight.sum((1, 2)) * C
+    return NormalEquations(M[:, :8, :8], M[:, :8, 8], cost, total, M[:, 8, 8])

@@ -1,0 +1,269 @@
+"""The named worlds: what stands where, and what it is made of, drawn from a seed."""
+
+import math
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import cv2
+import torch
+from torch import Tensor
+
+from torchvo360.checks import InputError, check_choice
+from torchvo360.data.synthetic.geometry import Solids
+from torchvo360.data.synthetic.materials import draw
+from torchvo360.data.synthetic.texture import HEIGHT, WIDTH, TextureAtlas
+from torchvo360.data.synthetic.world import Faces, Lamp, Mover, Walkway, World
+
+WORLDS = ("room", "pillars", "courtyard")
+FREE_WIDTH = 0.55
+"""Distance kept between the walkway and any solid, metres."""
+NORMALS = torch.tensor([[1.0, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0], [0, 0, 1], [0, 0, -1]])
+
+
+@dataclass
+class _Builder:
+    """Collects solids that keep clear of the walkway and of each other."""
+
+    generator: torch.Generator
+    size: tuple[float, float, float]
+    walkway: Walkway
+    materials: tuple[str, ...]
+    texels_per_metre: float
+    boxes: list[tuple[float, ...]] = field(default_factory=list)
+    """Centre, half sizes, heading, 1 for a cylinder, of each solid."""
+    looks: list[list[tuple[int, tuple[float, ...]]]] = field(default_factory=list)
+    """Chart and tint of the six faces of each solid."""
+
+    def uniform(self, low: float, high: float) -> float:
+        """Draw a number in [low, high)."""
+        return low + (high - low) * float(torch.rand((), generator=self.generator))
+
+    def tint(self, low: float = 0.45, high: float = 1.0) -> tuple[float, ...]:
+        """Draw a colour factor."""
+        return tuple(self.uniform(low, high) for _ in range(3))
+
+    def chart(self, *names: str) -> int:
+        """Draw one of the named materials."""
+        return self.materials.index(names[int(self.uniform(0, len(names)))])
+
+    def is_free(self, x: float, y: float, radius: float, gap: float) -> bool:
+        """Return whether a disc keeps off the walkway, the walls and what stands on the floor."""
+        angle = torch.linspace(0, math.tau, 181, dtype=torch.float64)
+        (ox, oy), (a, b) = self.walkway.centre, self.walkway.radii
+        to_path = torch.hypot(ox + a * angle.cos() - x, oy + b * angle.sin() - y).amin()
+        others = [
+            math.hypot(box[0] - x, box[1] - y) > radius + gap + (box[3] if box[7] else math.hypot(box[3], box[4]))
+            for box in self.boxes
+        ]
+        inside = abs(x) + radius < self.size[0] / 2 and abs(y) + radius < self.size[1] / 2
+        return inside and all(others) and float(to_path) > radius + FREE_WIDTH
+
+    def add(self, *, centre: tuple[float, ...], half: tuple[float, ...], heading: float, chart: int, is_round: bool = False) -> None:
+        """Add a solid of one material, each face with its own shade of one colour."""
+        colour = self.tint()
+        self.boxes.append((*centre, *half, heading, float(is_round)))
+        self.looks.append([(chart, tuple(c * self.uniform(0.75, 1.0) for c in colour)) for _ in range(6)])
+
+    def place(
+        self, count: int, charts: tuple[str, ...], *, radius: tuple[float, float], height: tuple[float, float],
+        rounds: float = 0.0, gap: float = 0.1, turned: bool = True,
+    ) -> None:  # fmt: skip
+        """Stand up to `count` solids on the floor where they fit.
+
+        Args:
+            count: How many are tried for.
+            charts: Materials to draw from.
+            radius: Range of the half size in plan, metres.
+            height: Range of the height, metres.
+            rounds: Share of cylinders.
+            gap: Least distance to the others, metres.
+            turned: Whether boxes stand at any heading, or along the walls.
+        """
+        placed = 0
+        for _ in range(60 * count):
+            if placed == count:
+                return
+            is_round = self.uniform(0, 1) < rounds
+            a, b = self.uniform(*radius), self.uniform(*radius)
+            b = a if is_round else b
+            x, y = (self.uniform(-side / 2, side / 2) for side in self.size[:2])
+            if self.is_free(x, y, a if is_round else math.hypot(a, b), gap):
+                h = self.uniform(*height) / 2
+                heading = self.uniform(0, math.pi / 2) if turned and not is_round else 0.0
+                self.add(centre=(x, y, h), half=(a, b, h), heading=heading, chart=self.chart(*charts), is_round=is_round)
+                placed += 1
+
+    def hang(self, count: int, charts: tuple[str, ...], *, depth: float = 0.02) -> None:
+        """Hang pictures on the walls, away from the corners."""
+        length, width, height = self.size
+        for k in range(count):
+            along_x = k % 2 == 0
+            side = 1 if k % 4 < 2 else -1
+            half, tall = self.uniform(0.3, 0.6), self.uniform(0.25, 0.5)
+            span = (length if along_x else width) / 2 - half - 0.2
+            at, z = self.uniform(-span, span), self.uniform(1.1 + tall - 0.3, min(2.2, height - tall - 0.1))
+            wall = side * ((width if along_x else length) / 2 - depth / 2)
+            centre, size = ((at, wall), (half, depth)) if along_x else ((wall, at), (depth, half))
+            self.add(centre=(*centre, z), half=(*size, tall), heading=0.0, chart=self.chart(*charts))
+
+    def stack(self, count: int, charts: tuple[str, ...], *, most_height: float) -> None:
+        """Put small boxes on top of low ones."""
+        low = [box for box in self.boxes if not box[7] and 0.3 < 2 * box[5] < most_height and box[2] == box[5]]
+        for x, y, _, a, b, h, heading, _ in low[:count]:
+            share, tall = self.uniform(0.25, 0.55), self.uniform(0.08, 0.25)
+            half = (a * share, b * share, tall)
+            self.add(centre=(x, y, 2 * h + tall), half=half, heading=heading + 0.4, chart=self.chart(*charts))
+
+    def build(
+        self, name: str, shell: list[tuple[int, tuple[float, ...]]], *, lamps: tuple[Lamp, ...], ambient: float,
+        sky: int | None = None, movers: int = 0, panorama: Tensor | None = None,
+    ) -> World:  # fmt: skip
+        """Join everything into a world; the shell gets six faces, the sky one."""
+        length, width, height = self.size
+        first_mover = len(self.boxes) + 1
+        swings = [self._add_mover(k) for k in range(movers)]
+        boxes = torch.tensor([(0, 0, height / 2, length / 2, width / 2, height / 2, 0, 0), *self.boxes], dtype=torch.float64)
+        solids = Solids(
+            centre=boxes[:, :3].float(),
+            half=boxes[:, 3:6].float(),
+            heading=torch.stack([boxes[:, 6].cos(), boxes[:, 6].sin()], -1).float(),
+            is_round=boxes[:, 7] > 0,
+            open_above=sky is not None,
+        )
+        panorama_chart = -1
+        images = [draw(material, self.generator) for material in self.materials]
+        if panorama is not None:
+            panorama_chart = len(images)
+            images.append(panorama)
+            if sky is None:
+                shell = [(panorama_chart, (1.0, 1.0, 1.0))] * 6
+            else:
+                sky = panorama_chart
+        looks = [*shell, *(look for solid in self.looks for look in solid)]
+        looks.append((0 if sky is None else sky, (1.0, 1.0, 1.0)))
+        rows = len(looks)
+        corner = torch.rand(2, rows, generator=self.generator) * torch.tensor([[WIDTH], [HEIGHT]])
+        density = self.texels_per_metre * (0.85 + 0.4 * torch.rand(rows, generator=self.generator))
+        density[:6], density[-1] = self.texels_per_metre, 140.0
+        c, s = solids.heading.mT[..., None]
+        x, y, z = NORMALS.mT
+        normal = torch.stack([c * x - s * y, s * x + c * y, z.expand(len(boxes), 6)]).flatten(1)
+        normal[:, :6] *= -1
+        faces = Faces(
+            chart=torch.tensor([float(chart) for chart, _ in looks]),
+            corner=corner,
+            density=density,
+            tint=torch.tensor([tint for _, tint in looks]).mT.contiguous(),
+            normal=torch.cat([normal, torch.zeros(3, 1)], 1),
+        )
+        return World(
+            name=name,
+            solids=solids,
+            faces=faces,
+            atlas=TextureAtlas.of(torch.stack(images)),
+            lamps=lamps,
+            ambient=ambient,
+            walkway=self.walkway,
+            movers=tuple(
+                Mover(first_mover + k, swing, period_s=3.0 + k) for k, swing in enumerate(swings)
+            ),
+            panorama_chart=panorama_chart,
+            panorama_centre=(*self.walkway.centre, self.walkway.eye_height),
+        )
+
+    def _add_mover(self, number: int) -> tuple[float, float, float]:
+        """Add a box that swings along the walkway's tangent, inside it or outside it, and return its swing."""
+        (ox, oy), (a, b) = self.walkway.centre, self.walkway.radii
+        angle = self.uniform(0, math.tau)
+        outward = (max(a, b) + FREE_WIDTH + 0.35) if number % 2 == 0 else 0.0
+        x, y = ox + outward * math.cos(angle), oy + outward * math.sin(angle)
+        reach = 1.2 if outward else max(0.2, min(a, b) - FREE_WIDTH - 0.3)
+        along = (-math.sin(angle) * reach, math.cos(angle) * reach)
+        self.add(centre=(x, y, 0.7), half=(0.18, 0.18, 0.7), heading=0.3, chart=self.chart(*self.materials[-2:]))
+        return (*along, 0.0)
+
+
+def make_world(name: str, *, seed: int = 0, panorama: str | Path | None = None, moving_objects: int = 0) -> World:
+    """Make one of the named worlds.
+
+    Args:
+        name: `room` (7.5 x 6 x 2.8 m, furnished), `pillars` (a hall of 14 x 11 x 4 m) or `courtyard` (18 x 14 m, walls and sky).
+        seed: Where things stand and what they look like.
+        panorama: An equirectangular image that the walls wear, or the sky where there is one; None for procedural looks.
+        moving_objects: Boxes that swing beside the walkway.
+
+    Raises:
+        InputError: The name is another one, or the panorama cannot be read.
+    """
+    check_choice("world", name, WORLDS)
+    generator = torch.Generator().manual_seed(seed)
+    image = None if panorama is None else _read_panorama(Path(panorama))
+    makers = {"room": _room, "pillars": _pillars, "courtyard": _courtyard}
+    return makers[name](generator, moving_objects, image)
+
+
+def _read_panorama(path: Path) -> Tensor:
+    image = cv2.imread(str(path), cv2.IMREAD_COLOR) if path.is_file() else None
+    if image is None:
+        raise InputError(f"panorama: expected the path of a readable image, got {str(path)!r}.")
+    size = cv2.INTER_AREA if image.shape[1] > WIDTH else cv2.INTER_CUBIC
+    rgb = cv2.cvtColor(cv2.resize(image, (WIDTH, HEIGHT), interpolation=size), cv2.COLOR_BGR2RGB)
+    return torch.from_numpy(rgb).permute(2, 0, 1).float() / 255
+
+
+def _room(generator: torch.Generator, movers: int, panorama: Tensor | None) -> World:
+    walkway = Walkway(centre=(0.2, -0.1), radii=(1.45, 1.0), eye_height=1.5)
+    materials = ("plaster", "brick", "planks", "stones", "collage", "mural")
+    b = _Builder(generator, (7.5, 6.0, 2.8), walkway, materials, 100.0)
+    b.place(3, ("planks", "mural"), radius=(0.18, 0.3), height=(1.6, 2.2), turned=False)
+    b.place(2, ("brick", "stones"), radius=(0.14, 0.2), height=(2.8, 2.8), rounds=0.6)
+    b.place(9, ("planks", "collage", "mural", "plaster"), radius=(0.2, 0.5), height=(0.35, 0.95))
+    b.place(4, ("collage", "mural"), radius=(0.1, 0.18), height=(0.3, 1.3), rounds=0.7)
+    b.stack(6, ("collage", "mural", "planks"), most_height=1.0)
+    b.hang(6, ("collage", "mural"))
+    plain, warm = b.chart("plaster"), b.chart("collage")
+    shell = [
+        (plain, b.tint(0.75)), (b.chart("brick"), (1.0, 0.78, 0.66)), (b.chart("mural"), b.tint(0.6)),
+        (plain, b.tint(0.75)), (b.chart("planks"), (0.95, 0.9, 0.85)), (warm, (0.7, 0.7, 0.7)),
+    ]  # fmt: skip
+    # faces of the shell are named by the outside: row 4 is the ceiling, row 5 the floor
+    shell[4], shell[5] = (b.chart("stones"), (0.95, 0.95, 1.0)), shell[4]
+    lamps = (Lamp((1.2, 0.8, 2.6), 0.75, 2.6), Lamp((-2.0, -1.2, 2.6), 0.55, 2.2))
+    return b.build("room", shell, lamps=lamps, ambient=0.42, movers=movers, panorama=panorama)
+
+
+def _pillars(generator: torch.Generator, movers: int, panorama: Tensor | None) -> World:
+    walkway = Walkway(centre=(0.0, 0.0), radii=(1.9, 1.35), eye_height=1.6)
+    materials = ("plaster", "stones", "paving", "brick", "collage", "mural")
+    b = _Builder(generator, (14.0, 11.0, 4.0), walkway, materials, 80.0)
+    b.place(18, ("brick", "stones", "collage", "mural"), radius=(0.16, 0.36), height=(4.0, 4.0), rounds=0.7, gap=0.7)
+    b.place(10, ("collage", "mural", "stones"), radius=(0.2, 0.5), height=(0.4, 1.2), gap=0.2)
+    b.stack(5, ("collage", "mural"), most_height=1.3)
+    b.hang(6, ("collage", "mural"))
+    shell = [
+        (b.chart("brick"), (1.0, 0.85, 0.75)), (b.chart("plaster"), b.tint(0.75)), (b.chart("stones"), b.tint(0.75)),
+        (b.chart("brick"), (0.9, 0.9, 0.95)), (b.chart("mural"), (0.75, 0.75, 0.75)), (b.chart("paving"), (1.0, 0.97, 0.92)),
+    ]  # fmt: skip
+    lamps = (Lamp((3.0, 2.0, 3.8), 0.8, 4.5), Lamp((-3.5, -2.0, 3.8), 0.7, 4.0))
+    return b.build("pillars", shell, lamps=lamps, ambient=0.38, movers=movers, panorama=panorama)
+
+
+def _courtyard(generator: torch.Generator, movers: int, panorama: Tensor | None) -> World:
+    walkway = Walkway(centre=(0.5, 0.0), radii=(1.9, 1.4), eye_height=1.6)
+    materials = ("brick", "stones", "paving", "planks", "clouds", "collage", "mural")
+    b = _Builder(generator, (18.0, 14.0, 3.6), walkway, materials, 75.0)
+    b.place(6, ("planks", "stones"), radius=(0.12, 0.25), height=(2.5, 4.5), rounds=1.0, gap=0.8)
+    trunks = list(b.boxes)
+    b.place(14, ("collage", "mural", "brick", "planks"), radius=(0.25, 0.8), height=(0.4, 2.2), gap=0.4)
+    b.stack(6, ("collage", "mural"), most_height=1.6)
+    for x, y, _, _, _, h, _, _ in trunks:
+        crown = b.uniform(0.5, 0.9)
+        b.add(centre=(x, y, 2 * h), half=(crown, crown, 0.6), heading=b.uniform(0, 1.5), chart=b.chart("mural"))
+    shell = [
+        (b.chart("brick"), (1.0, 0.8, 0.7)), (b.chart("stones"), b.tint(0.75)), (b.chart("brick"), (0.9, 0.9, 0.9)),
+        (b.chart("mural"), (0.85, 0.8, 0.75)), (b.chart("paving"), (1.0, 1.0, 1.0)), (b.chart("paving"), (1.0, 0.98, 0.95)),
+    ]  # fmt: skip
+    # the sun stands far away: one lamp whose light hardly falls off
+    lamps = (Lamp((60.0, 35.0, 80.0), 0.6, 1e4),)
+    sky = b.chart("clouds")
+    return b.build("courtyard", shell, lamps=lamps, ambient=0.5, sky=sky, movers=movers, panorama=panorama)

@@ -1,0 +1,26 @@
+"""What is done to an image before any residual: padding, pyramids, gradients, look-up and selection."""
+
+from torchvo360.image.covector import covector_field, gradient, gradient_magnitude
+from torchvo360.image.padding import pad_image
+from torchvo360.image.pyramid import blur, level_camera, masked_pyramid, pyramid, resample
+from torchvo360.image.sampling import Interpolated, Taps, interpolate, locate, sample
+from torchvo360.image.selection import equal_area_cells, select_pixels
+
+__all__ = [
+    "Interpolated",
+    "Taps",
+    "blur",
+    "covector_field",
+    "equal_area_cells",
+    "gradient",
+    "gradient_magnitude",
+    "interpolate",
+    "level_camera",
+    "locate",
+    "masked_pyramid",
+    "pad_image",
+    "pyramid",
+    "resample",
+    "sample",
+    "select_pixels",
+]

@@ -1,0 +1,66 @@
+"""Selection of pixels that are spread evenly over the sphere and carry gradient."""
+
+import math
+
+import torch
+from jaxtyping import Bool, Float, Int64
+from torch import Tensor
+
+from torchvo360.cameras import Camera
+from torchvo360.checks import check_shape
+
+
+def equal_area_cells(camera: Camera, count: int, *, device: torch.device | str = "cpu") -> Int64[Tensor, "H W"]:
+    """Number the pixels' cells: about `count` cells of nearly equal solid angle over the image.
+
+    A full panorama is cut into bands of latitude, and each band into as many cells as its circumference asks for.
+    Other cameras are cut into squares of the image, whose solid angle varies little.
+    """
+    rows = torch.arange(camera.height, device=device)
+    columns = torch.arange(camera.width, device=device)
+    if camera.wraps:
+        side = math.sqrt(4 * math.pi / count)
+        bands = max(1, round(math.pi / side))
+        band = (rows * bands) // camera.height
+        middle = (torch.arange(bands, dtype=torch.float64, device=device) + 0.5) / bands * math.pi
+        cells = (math.tau * middle.sin() / side).round().long().clamp_min(1)
+        first = torch.cat([cells.new_zeros(1), cells.cumsum(0)])
+        return first[band][:, None] + (columns * cells[band][:, None]) // camera.width
+    side_px = math.sqrt(camera.width * camera.height / count)
+    across = max(1, round(camera.width / side_px))
+    down = max(1, round(camera.height / side_px))
+    return ((rows * down) // camera.height)[:, None] * across + (columns * across) // camera.width
+
+
+def select_pixels(
+    strength: Float[Tensor, "H W"],
+    usable: Bool[Tensor, "H W"],
+    camera: Camera,
+    count: int,
+    *,
+    minimum: float,
+) -> Int64[Tensor, "N"]:
+    """Choose the strongest usable pixel of each equal-area cell.
+
+    Args:
+        strength: Gradient magnitude, for instance `gradient_magnitude`.
+        usable: Pixels that may be chosen.
+        camera: The image's camera.
+        count: Number of cells over the whole image; cells without a usable, strong pixel give none.
+        minimum: Strength below which a pixel is never chosen.
+
+    Returns:
+        Flat indices in increasing order, at most one for each cell.
+    """
+    check_shape("strength", strength, f"{camera.height} {camera.width}")
+    check_shape("usable", usable, f"{camera.height} {camera.width}")
+    cell = equal_area_cells(camera, count, device=strength.device).flatten()
+    candidate = (usable & (strength >= minimum)).flatten().nonzero()[:, 0]
+    # Sorted by cell, then by falling strength: the first of each run is the cell's best. Stable, so ties go to the
+    # lower index and the choice is deterministic.
+    by_strength = candidate[strength.flatten()[candidate].argsort(descending=True, stable=True)]
+    order = by_strength[cell[by_strength].argsort(stable=True)]
+    run = cell[order]
+    first = torch.ones_like(run, dtype=torch.bool)
+    first[1:] = run[1:] != run[:-1]
+    return order[first].sort().values

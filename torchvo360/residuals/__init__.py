@@ -1,0 +1,1 @@
+"""What is minimised: residuals with their Jacobians, and how they are weighted."""

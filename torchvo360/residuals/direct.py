@@ -1,0 +1,166 @@
+"""The direct residual and its Jacobian for any central camera, photometric (C = 1) or feature-metric (C > 1).
+
+    r = I_tgt(project(R r_ref + rho t)) - (e^a I_ref + b)
+
+in the tangent form of equations.md, section 3: with the point's ray r2 and inverse range rho2 in the target and the image
+gradient as a covector G on that ray, the row of the Jacobian by (v, w, a, b) is [rho2 G, r2 x G, -e^a I_ref, -1].
+"""
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from torchvo360.cameras import Camera
+from torchvo360.image import interpolate, locate, pad_image
+
+
+@dataclass(frozen=True)
+class Reference:
+    """Points of the reference frames, ready for warping. Everything here is finite: unknown points weigh 0."""
+
+    ray: Float[Tensor, "B 3 N"]
+    """Rays in the reference camera; the batch axis may be 1, shared by all."""
+    rho: Float[Tensor, "B N"]
+    """Inverse range in the reference camera's measure, 1/m; 0 is at infinity."""
+    value: Float[Tensor, "B C N"]
+    """Intensities or features."""
+    weight: Float[Tensor, "B N"]
+    """How much each point counts, for instance its solid angle; 0 where it is not to be used."""
+    variance: Float[Tensor, "B N"] | None = None
+    """Variance of rho, 1/m^2; None where it is taken as exact."""
+
+    def take(self, index: Tensor) -> "Reference":
+        """Return the batch elements of an index."""
+        ray = self.ray if self.ray.shape[0] == 1 else self.ray[index]
+        variance = None if self.variance is None else self.variance[index]
+        return Reference(ray, self.rho[index], self.value[index], self.weight[index], variance)
+
+    def chunk(self, start: int, stop: int) -> "Reference":
+        """Return the points from start to stop of every element."""
+        variance = None if self.variance is None else self.variance[:, start:stop]
+        return Reference(
+            self.ray[..., start:stop],
+            self.rho[:, start:stop],
+            self.value[..., start:stop],
+            self.weight[:, start:stop],
+            variance,
+        )
+
+
+@dataclass(frozen=True)
+class Target:
+    """Target images, padded by one pixel for look-up (`make_target`)."""
+
+    camera: Camera
+    padded: Float[Tensor, "B C Hp Wp"]
+    confidence: Float[Tensor, "B 1 Hp Wp"] | None = None
+    """Weight of each pixel, looked up like the image; None where all count fully."""
+    saturation: float | None = None
+    """Values at or above this are clipped by the sensor and weigh nothing."""
+
+    def take(self, index: Tensor) -> "Target":
+        """Return the batch elements of an index."""
+        confidence = None if self.confidence is None else self.confidence[index]
+        return Target(self.camera, self.padded[index], confidence, self.saturation)
+
+
+def make_target(
+    image: Float[Tensor, "B C H W"],
+    camera: Camera,
+    confidence: Float[Tensor, "B H W"] | None = None,
+    saturation: float | None = None,
+) -> Target:
+    """Pad target images for look-up; pixels that are not finite must have been replaced, with confidence 0."""
+    padded = pad_image(image, camera, 1).contiguous()
+    if confidence is not None:
+        confidence = pad_image(confidence[:, None], camera, 1).contiguous()
+    return Target(camera, padded, confidence, saturation)
+
+
+class Samples(NamedTuple):
+    """Warped points and what they meet in the target; each tensor is [B, C, N] or broadcasts to it."""
+
+    ray: tuple[Tensor, Tensor, Tensor]
+    """Components of the rays in the target camera."""
+    rho: Tensor
+    """Inverse range in the target."""
+    inv_scale: Tensor
+    """1 / s of equations.md, section 3."""
+    G: tuple[Tensor, Tensor, Tensor]
+    """Components of the target's gradient as a covector."""
+    gained: Tensor
+    """e^a I_ref."""
+    residual: Tensor
+    weight: Tensor
+    """The points' weights times the target's confidence; 0 out of view."""
+
+
+def look_up(
+    reference: Reference, target: Target, T_tgt_ref: Float[Tensor, "B 4 4"], affine: Float[Tensor, "B 2"]
+) -> Samples:
+    """Warp the reference points into the targets and compare.
+
+    Args:
+        reference: Points.
+        target: Images.
+        T_tgt_ref: Poses, in the dtype of the points.
+        affine: (a, b) of each pair.
+    """
+    R, t = T_tgt_ref[:, :3, :3], T_tgt_ref[:, :3, 3:]
+    Y = torch.baddbmm(t * reference.rho[:, None], R, reference.ray.expand(R.shape[0], -1, -1))
+    x, y, z = Y.unbind(1)
+    camera = target.camera
+    inv_scale = camera.scale_of(x, y, z).reciprocal()
+    u, v = camera.pixel_of(x, y, z)
+    taps = locate(u, v, camera)
+    value, g_u, g_v = interpolate(target.padded, taps)
+    weight = reference.weight
+    if target.confidence is not None:
+        weight = weight * interpolate(target.confidence, taps).value[:, 0]
+    seen = None if camera.wraps else camera.sees(Y.mT, torch.stack([u, v], -1), margin=0.5)
+    if seen is not None:
+        weight = weight * seen
+    each = weight[:, None]
+    if target.saturation is not None:
+        each = each * (value < target.saturation)
+
+    rays = Y * inv_scale[:, None]
+    ray = (rays[:, :1], rays[:, 1:2], rays[:, 2:])
+    gained = affine[:, :1, None].exp() * reference.value
+    return Samples(
+        ray=ray,
+        rho=(reference.rho * inv_scale)[:, None],
+        inv_scale=inv_scale[:, None],
+        G=camera.covector_of(ray, g_u, g_v),
+        gained=gained,
+        residual=value - gained - affine[:, 1:, None],
+        weight=each,
+    )
+
+
+def by_rho(samples: Samples, t_tgt_ref: Float[Tensor, "B 3"]) -> Float[Tensor, "B C N"]:
+    """Return the derivative of the residual by the reference's inverse range: G . t / s."""
+    tx, ty, tz = t_tgt_ref[..., None, None].unbind(1)
+    Gx, Gy, Gz = samples.G
+    return (Gx * tx + Gy * ty + Gz * tz) * samples.inv_scale
+
+
+def system_rows(samples: Samples, root_weight: Float[Tensor, "B C N"]) -> Float[Tensor, "B 9 M"]:
+    """Return the Jacobian's eight columns by (v, w, a, b) and the residual, all times a root of a weight; M = C N."""
+    rx, ry, rz = samples.ray
+    Gx, Gy, Gz = (component * root_weight for component in samples.G)
+    rows = [
+        samples.rho * Gx,
+        samples.rho * Gy,
+        samples.rho * Gz,
+        torch.addcmul(ry * Gz, rz, Gy, value=-1),
+        torch.addcmul(rz * Gx, rx, Gz, value=-1),
+        torch.addcmul(rx * Gy, ry, Gx, value=-1),
+        samples.gained * -root_weight,
+        -root_weight,
+        samples.residual * root_weight,
+    ]
+    return torch.stack(rows, 1).flatten(2)

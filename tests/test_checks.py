@@ -86,13 +86,13 @@ class TestPose:
         ],
     )
     def test_another_matrix_is_refused_alone_and_inside_a_batch(self, spoilt: torch.Tensor):
-        with pytest.raises(InputError, match="^T_tgt_ref: expected rigid motions"):
+        with pytest.raises(InputError, match=r"^T_tgt_ref: expected rigid motions"):
             checks.check_pose("T_tgt_ref", spoilt)
-        with pytest.raises(InputError, match="^T_tgt_ref: expected rigid motions"):
+        with pytest.raises(InputError, match=r"^T_tgt_ref: expected rigid motions"):
             checks.check_pose("T_tgt_ref", torch.stack([torch.eye(4), spoilt]))
 
     def test_integers_and_other_shapes_are_refused(self):
-        with pytest.raises(InputError, match="^T_tgt_ref: expected a floating-point tensor"):
+        with pytest.raises(InputError, match=r"^T_tgt_ref: expected a floating-point tensor"):
             checks.check_pose("T_tgt_ref", torch.eye(4, dtype=torch.int64))
-        with pytest.raises(ShapeError, match="^T_tgt_ref: expected shape"):
+        with pytest.raises(ShapeError, match=r"^T_tgt_ref: expected shape"):
             checks.check_pose("T_tgt_ref", torch.eye(3))

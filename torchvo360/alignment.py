@@ -13,6 +13,7 @@ from jaxtyping import Bool, Float, Int64
 from torch import Tensor
 
 from torchvo360 import lie
+from torchvo360.agreement import agreement
 from torchvo360.backends import linearize
 from torchvo360.cameras import Camera
 from torchvo360.checks import (
@@ -25,6 +26,7 @@ from torchvo360.checks import (
 )
 from torchvo360.image import blur, level_camera, masked_pyramid, resample
 from torchvo360.residuals.direct import Reference, Target, make_target
+from torchvo360.residuals.normal import NormalEquations
 from torchvo360.residuals.weights import LossConfig
 from torchvo360.solve import LMConfig, Solution, Status, inverse_ldl, minimize
 
@@ -45,6 +47,8 @@ class AlignConfig:
     """Whether brightness gain and offset are estimated."""
     saturation: float | None = 252 / 255
     """Single-channel values at or above this are clipped and not used; None for features, which have no white."""
+    min_agreement: float = 0.5
+    """A solve that converged with less agreement than this ended in a false minimum: DIVERGED."""
     min_pixels: int = 64
     """Fewer usable pixels at a level are too few."""
     noise: float = 4 / 255
@@ -88,6 +92,8 @@ class AlignResult:
     """J^T W J by (v, w, a, b) at the end, undamped."""
     variance: Float[Tensor, "*batch"]
     """Variance of a residual at the end."""
+    agreement: Float[Tensor, "*batch"]
+    """Share of the image gradient that is matched to within half a pixel, 0 to 1."""
 
     def covariance(self) -> Float[Tensor, "*batch 8 8"]:
         """Return the covariance of (v, w, a, b) about the solution, `variance * H^-1`; infinite where H is singular.
@@ -124,7 +130,12 @@ def _levels(
     """Build every level's points and target, the finest first."""
     ref, ref_finite = _finite(ref)
     tgt, tgt_finite = _finite(tgt)
-    known = torch.isfinite(rho) & (rho >= 0) & usable & (ref_finite if bool(ref_finite.all()) else _erode(ref_finite, camera))
+    known = (
+        torch.isfinite(rho)
+        & (rho >= 0)
+        & usable
+        & (ref_finite if bool(ref_finite.all()) else _erode(ref_finite, camera))
+    )
     confidence = None if bool(tgt_finite.all()) else _erode(tgt_finite, camera).to(tgt.dtype)
     saturation = config.saturation if ref.shape[1] == 1 else None
     if saturation is not None:
@@ -202,10 +213,11 @@ def solve_level(
     """
     B = T_tgt_ref.shape[0]
 
-    def evaluate(state: tuple[Tensor, ...], index: Tensor):
+    def evaluate(state: tuple[Tensor, ...], index: Tensor) -> NormalEquations:
+        T, ab = state
         whole = index.numel() == B
         points, images = (reference, target) if whole else (reference.take(index), target.take(index))
-        return linearize(points, images, *state, config.loss, noise=config.noise)
+        return linearize(points, images, T, ab, config.loss, noise=config.noise)
 
     def retract(state: tuple[Tensor, ...], delta: Tensor) -> tuple[Tensor, ...]:
         T, ab = state
@@ -285,7 +297,7 @@ def align(
     flat = [value.reshape(B, *value.shape[len(batch) :]) for value in (ref, tgt.to(ref.dtype), rho.to(ref.dtype))]
     usable = torch.ones_like(flat[2], dtype=torch.bool) if mask is None else mask.reshape(flat[2].shape).bool()
     each = None if weight is None else weight.reshape(flat[2].shape).to(ref.dtype)
-    levels = _levels(*flat, usable, each, camera, config)
+    levels = _levels(flat[0], flat[1], flat[2], usable, each, camera, config)
     if T_tgt_ref is None:
         T = torch.eye(4, dtype=torch.float64, device=ref.device).repeat(B, 1, 1)
     else:
@@ -294,17 +306,34 @@ def align(
     return _coarse_to_fine(levels, T, affine, config, batch)
 
 
-def _coarse_to_fine(levels: list[_Level], T: Tensor, affine: Tensor, config: AlignConfig, batch: torch.Size) -> AlignResult:
+def _coarse_to_fine(
+    levels: list[_Level], T: Tensor, affine: Tensor, config: AlignConfig, batch: torch.Size
+) -> AlignResult:
     steps = torch.zeros(T.shape[0], dtype=torch.int64, device=T.device)
-    solution = None
-    for number in range(len(levels) - 1, config.finest - 1, -1):
-        level = levels[number]
-        most = config.steps_by_level[min(number, len(config.steps_by_level) - 1)]
-        solution = solve_level(level.reference, level.target, T, affine, config, max_steps=most)
+    for number in range(len(levels) - 1, config.finest, -1):
+        solution = _solve_numbered(levels, number, T, affine, config)
         T, affine = solution.state
         steps = steps + solution.steps
-    assert solution is not None
-    equations, status = solution.equations, solution.status
-    variance = equations.square / (equations.weight - 8).clamp_min(1)
-    shape = lambda value: value.reshape(*batch, *value.shape[1:])
-    return AlignResult(shape(T), shape(affine[:, 0]), shape(affine[:, 1]), shape(status), shape(equations.cost / equations.weight), shape(steps), shape(equations.H), shape(variance))
+    solution = _solve_numbered(levels, config.finest, T, affine, config)
+    T, affine = solution.state
+    equations = solution.equations
+    agreed = agreement(levels[config.finest].reference, levels[config.finest].target, T, affine).double()
+    false_minimum = (solution.status == Status.CONVERGED) & (agreed < config.min_agreement)
+    status = torch.where(false_minimum, int(Status.DIVERGED), solution.status)
+    fields = {
+        "T_tgt_ref": T,
+        "a": affine[:, 0],
+        "b": affine[:, 1],
+        "status": status,
+        "cost": torch.where(equations.weight > 0, equations.cost / equations.weight, torch.inf),
+        "steps": steps + solution.steps,
+        "H": equations.H,
+        "variance": equations.square / (equations.weight - 8).clamp_min(1),
+        "agreement": agreed,
+    }
+    return AlignResult(**{name: value.reshape(*batch, *value.shape[1:]) for name, value in fields.items()})
+
+
+def _solve_numbered(levels: list[_Level], number: int, T: Tensor, affine: Tensor, config: AlignConfig) -> Solution:
+    most = config.steps_by_level[min(number, len(config.steps_by_level) - 1)]
+    return solve_level(levels[number].reference, levels[number].target, T, affine, config, max_steps=most)

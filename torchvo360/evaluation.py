@@ -16,12 +16,15 @@ from torchvo360.data.registration import associate, nearest, rotation_between, s
 from torchvo360.data.trajectory import Trajectory
 from torchvo360.lie import se3_inverse, so3_angle
 
+NEGLIGIBLE_M = 1e-9
+"""Errors below this are rounding, and 0 % of any path: also of one without length."""
+
 
 @dataclass(frozen=True, eq=False)
 class Evaluation:
     """Errors of an estimate, over the poses that have a true one at their time.
 
-    A percentage of a true path without length is infinite, or 0 where there is no error either.
+    A percentage of a true path without length is infinite, or 0 where the error is below a nanometre.
     """
 
     ate_rmse_m: float
@@ -75,19 +78,19 @@ def evaluate(estimate: Trajectory, truth: Trajectory, *, align: str = "sim3", rp
     scale = float(torch.linalg.det(S[:3, :3]).pow(1 / 3))
 
     error_m = torch.linalg.vector_norm(p_estimate @ S[:3, :3].mT + S[:3, 3] - p_truth, dim=-1)
-    ate_rmse_m = float(error_m.square().mean().sqrt())
-    path_length_m = float(torch.linalg.vector_norm(p_truth.diff(dim=0), dim=-1).sum())
+    ate_rmse_m = error_m.square().mean().sqrt()
+    path_length_m = torch.linalg.vector_norm(p_truth.diff(dim=0), dim=-1).sum()
     R_error = T_truth[:, :3, :3].mT @ R @ T_estimate[:, :3, :3]
     rpe_translation_percent, rpe_rotation_deg = _relative_errors(T_estimate, T_truth, scale, rpe_frames)
     return Evaluation(
-        ate_rmse_m=ate_rmse_m,
-        ate_percent=_percent(ate_rmse_m, path_length_m),
+        ate_rmse_m=float(ate_rmse_m),
+        ate_percent=float(_percent(ate_rmse_m, path_length_m)),
         rpe_translation_percent=rpe_translation_percent,
         rpe_rotation_deg=rpe_rotation_deg,
         rotation_median_deg=math.degrees(float(so3_angle(R_error).median())),
         coverage=_coverage(estimate, truth),
         scale=scale,
-        path_length_m=path_length_m,
+        path_length_m=float(path_length_m),
         pairs=len(i_estimate),
         T_truth_estimate=S,
     )
@@ -103,16 +106,11 @@ def _relative_errors(
     rotation_deg = so3_angle(true[:, :3, :3].mT @ estimated[:, :3, :3]).rad2deg()
     error_m = torch.linalg.vector_norm(scale * estimated[:, :3, 3] - true[:, :3, 3], dim=-1)
     moved_m = torch.linalg.vector_norm(true[:, :3, 3], dim=-1)
-    percent = torch.tensor(
-        [_percent(error, moved) for error, moved in zip(error_m.tolist(), moved_m.tolist(), strict=True)]
-    )
-    return float(percent.median()), float(rotation_deg.median())
+    return float(_percent(error_m, moved_m).median()), float(rotation_deg.median())
 
 
-def _percent(error: float, of: float) -> float:
-    if of > 0:
-        return 100 * error / of
-    return 0.0 if error == 0 else math.inf
+def _percent(error: Float64[Tensor, "*batch"], of: Float64[Tensor, "*batch"]) -> Float64[Tensor, "*batch"]:
+    return torch.where(error > NEGLIGIBLE_M, 100 * error / of, 0.0)
 
 
 def _coverage(estimate: Trajectory, truth: Trajectory) -> float:

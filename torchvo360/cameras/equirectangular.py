@@ -129,15 +129,15 @@ class Equirectangular(Camera):
         fx, fy, _, _ = self.intrinsics
         x, y, z = ray
         # Nearer to a pole than the first row's centre an interpolated gradient along u no longer shrinks with cos(lat):
-        # there cos(lat) is held at that row's value, or G would grow without bound.
-        cos_lat2 = torch.addcmul(x * x, z, z).clamp_min(math.sin(0.5 / fy) ** 2)
-        inv_cos_lat = cos_lat2.rsqrt()
+        # there 1 / cos(lat) is held at that row's value, or G would grow without bound; G . ray stays 0.
+        horizontal2 = torch.addcmul(x * x, z, z)
+        inv_cos_lat = horizontal2.clamp_min(math.sin(0.5 / fy) ** 2).rsqrt()
         along_lat = g_v * fy
         radial = along_lat * y * inv_cos_lat
         turn = g_u * fx * inv_cos_lat * inv_cos_lat
         Gx = torch.addcmul(radial * x, turn, z)
         Gz = torch.addcmul(radial * z, turn, x, value=-1)
-        return Gx, -along_lat * cos_lat2 * inv_cos_lat, Gz
+        return Gx, -along_lat * horizontal2 * inv_cos_lat, Gz
 
     def ray_jacobian_intrinsics(self, uv: Float[Tensor, "*batch 2"]) -> Float[Tensor, "*batch 3 4"]:
         fx, fy, _, _ = self.intrinsics

@@ -47,7 +47,7 @@ def parse_mask(spec: str | Sequence[str], camera: Camera) -> Bool[Tensor, "H W"]
     left = float(area[use].sum() / area.sum())
     if left < LEAST_SHARE:
         raise InputError(
-            f"mask: expected at least {LEAST_SHARE:.0%} of the image to be left, got {left:.1%} from {spec}."
+            f"mask: expected at least {LEAST_SHARE:.0%} of the image to be left, got {left:.2%} from {spec}."
         )
     return use
 

@@ -25,7 +25,7 @@ def time_tolerance_ns(estimate: Trajectory) -> int:
 
 def nearest(t_ns: Int64[Tensor, "N"], among_t_ns: Int64[Tensor, "M"]) -> Int64[Tensor, "N"]:
     """Return, for each time, the index of the nearest one among sorted others; the earlier one in a tie."""
-    after = torch.searchsorted(among_t_ns, t_ns).clamp(max=len(among_t_ns) - 1)
+    after = torch.searchsorted(among_t_ns.contiguous(), t_ns.contiguous()).clamp(max=len(among_t_ns) - 1)
     before = (after - 1).clamp(min=0)
     return torch.where(t_ns - among_t_ns[before] <= (among_t_ns[after] - t_ns).abs(), before, after)
 

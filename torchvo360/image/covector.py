@@ -18,12 +18,23 @@ def gradient(
     return g_u, g_v
 
 
-def covector_field(image: Float[Tensor, "*batch H W"], camera: Camera) -> Float[Tensor, "*batch 3 H W"]:
-    """Return G at every pixel's centre, from central differences: `dI = G . d(ray)`, `G . ray = 0`."""
-    x, y, z = camera.ray_grid(dtype=image.dtype, device=image.device).unbind(-1)
+def covector_field(
+    image: Float[Tensor, "*batch H W"], camera: Camera, rays: Float[Tensor, "H W 3"] | None = None
+) -> Float[Tensor, "*batch 3 H W"]:
+    """Return G at every pixel's centre, from central differences: `dI = G . d(ray)`, `G . ray = 0`.
+
+    Args:
+        image: Values at the camera's pixels.
+        camera: The image's camera.
+        rays: `camera.ray_grid()`, where it is at hand already.
+    """
+    rays = camera.ray_grid(dtype=image.dtype, device=image.device) if rays is None else rays
+    x, y, z = rays.unbind(-1)
     return torch.stack(camera.covector_of((x, y, z), *gradient(image, camera)), -3)
 
 
-def gradient_magnitude(image: Float[Tensor, "*batch H W"], camera: Camera) -> Float[Tensor, "*batch H W"]:
+def gradient_magnitude(
+    image: Float[Tensor, "*batch H W"], camera: Camera, rays: Float[Tensor, "H W 3"] | None = None
+) -> Float[Tensor, "*batch H W"]:
     """Return |G| in intensity per pixel of the image's middle: equally strong edges are equal at every latitude."""
-    return torch.linalg.vector_norm(covector_field(image, camera), dim=-3) * camera.pixel_angle
+    return torch.linalg.vector_norm(covector_field(image, camera, rays), dim=-3) * camera.pixel_angle

@@ -1,9 +1,9 @@
 """Exact ray casting against upright solids inside a shell.
 
-A solid is a rectangle or a disc in plan, extruded between two heights: a ray meets it where the intervals inside its plan
-and between its heights overlap. The shell is the box all cameras are in, open above or closed. The world is z up, metres.
-All groups of rays meet all solids they might hit at once: a group is a cone, and a solid is looked at only if its
-intervals of azimuth and elevation overlap the cone's.
+A solid is a rectangle or a disc in plan, extruded between two heights: a ray meets it where the intervals inside its
+plan and between its heights overlap. The shell is the box all cameras are in, open above or closed. The world is z up,
+metres. All groups of rays meet all solids they might hit at once: a group is a cone, and a solid is looked at only if
+its intervals of azimuth and elevation overlap the cone's.
 """
 
 import math
@@ -15,6 +15,8 @@ from torch import Tensor
 
 NEAR = 1e-4
 """Hits nearer than this are the surface the camera is on, metres."""
+TINY = 1e-15
+"""Added to a ray's components: it changes none but zero, whose slab then is met at +-1e15 instead of at 0 * inf."""
 
 
 @dataclass(frozen=True)
@@ -53,11 +55,11 @@ class Solids:
             range: How often the ray fits between the camera and what it meets; inf for the sky.
             solid: Row of what it meets: 0 for the shell, P for the sky.
         """
-        inverse = 1 / torch.where(ray == 0, 1e-30, ray)
+        inverse = 1 / (ray + TINY)
         reach = self._leave_shell(origin, ray, inverse)
         met = torch.zeros_like(reach, dtype=torch.int32)
         met.masked_fill_(reach.isinf(), len(self.centre))
-        group, solid = (self._might_hit(origin, axis, angle)).nonzero(as_tuple=True)
+        group, solid = self._might_hit(origin, axis, angle).nonzero(as_tuple=True)
         is_round = self.is_round[solid]
         for rounds in (False, True):
             chosen = (is_round == rounds).nonzero()[:, 0]
@@ -70,6 +72,22 @@ class Solids:
                 pair, lane = first.nonzero(as_tuple=True)
                 met[g[pair], lane] = p[pair].int()
         return reach, met
+
+    def clearance(self, point: Float[Tensor, "N 3"]) -> Float[Tensor, "N"]:
+        """Return the distance from points to the nearest surface, metres; negative outside free space."""
+        x, y, z = (point[:, None] - self.centre.to(point)).unbind(-1)
+        c, s = self.heading.to(point).mT
+        half = self.half.to(point)
+        sides = torch.stack([c * x + s * y, c * y - s * x], -1).abs() - half[:, :2]
+        radial = torch.hypot(x, y) - half[:, 0]
+        beside = torch.where(self.is_round, radial, torch.linalg.vector_norm(sides.clamp_min(0), dim=-1)).clamp_min(0)
+        within = torch.where(self.is_round, radial, sides.amax(-1))
+        over = z.abs() - half[:, 2]
+        distance = torch.hypot(beside, over.clamp_min(0)) + torch.maximum(within, over).clamp_max(0)
+        walls = [half[0, 0] - x[:, 0].abs(), half[0, 1] - y[:, 0].abs(), half[0, 2] + z[:, 0]]
+        if not self.open_above:
+            walls.append(half[0, 2] - z[:, 0])
+        return torch.stack([*distance[:, 1:].unbind(1), *walls]).amin(0)
 
     def _leave_shell(
         self, origin: Float[Tensor, "3"], ray: Float[Tensor, "3 G R"], inverse: Float[Tensor, "3 G R"]
@@ -120,7 +138,7 @@ class Solids:
         c, s = self.heading[solid].mT[..., None]
         middle, extent = -z * inverse_z, (half_z * inverse_z).abs()
         enter, leave = middle - extent, middle + extent
-        dx, dy = c * ray[0] + s * ray[1], c * ray[1] - s * ray[0]
+        dx, dy = c * ray[0] + s * ray[1] + TINY, c * ray[1] - s * ray[0] + TINY
         x, y = c * x + s * y, c * y - s * x
         if rounds:
             # |o + t d| = r in plan; the discriminant as a r^2 - (o x d)^2 keeps its digits far away

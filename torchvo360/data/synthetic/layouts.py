@@ -11,13 +11,16 @@ from torch import Tensor
 from torchvo360.checks import InputError, check_choice
 from torchvo360.data.synthetic.geometry import Solids
 from torchvo360.data.synthetic.materials import draw
+from torchvo360.data.synthetic.surfaces import Faces, Lamp, Surfaces
 from torchvo360.data.synthetic.texture import HEIGHT, WIDTH, TextureAtlas
-from torchvo360.data.synthetic.world import Faces, Lamp, Mover, Walkway, World
+from torchvo360.data.synthetic.world import Mover, Walkway, World
 
 WORLDS = ("room", "pillars", "courtyard")
 FREE_WIDTH = 0.55
 """Distance kept between the walkway and any solid, metres."""
-NORMALS = torch.tensor([[1.0, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0], [0, 0, 1], [0, 0, -1]])
+NORMALS = ((1.0, 0.0, 0.0), (-1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, -1.0, 0.0), (0.0, 0.0, 1.0), (0.0, 0.0, -1.0))
+SKY_DENSITY = 140.0
+"""Texels a radian at the zenith."""
 
 
 @dataclass
@@ -38,7 +41,7 @@ class _Builder:
         """Draw a number in [low, high)."""
         return low + (high - low) * float(torch.rand((), generator=self.generator))
 
-    def tint(self, low: float = 0.45, high: float = 1.0) -> tuple[float, ...]:
+    def tint(self, low: float = 0.65, high: float = 1.1) -> tuple[float, ...]:
         """Draw a colour factor."""
         return tuple(self.uniform(low, high) for _ in range(3))
 
@@ -58,7 +61,9 @@ class _Builder:
         inside = abs(x) + radius < self.size[0] / 2 and abs(y) + radius < self.size[1] / 2
         return inside and all(others) and float(to_path) > radius + FREE_WIDTH
 
-    def add(self, *, centre: tuple[float, ...], half: tuple[float, ...], heading: float, chart: int, is_round: bool = False) -> None:
+    def add(
+        self, *, centre: tuple[float, ...], half: tuple[float, ...], heading: float, chart: int, is_round: bool = False
+    ) -> None:
         """Add a solid of one material, each face with its own shade of one colour."""
         colour = self.tint()
         self.boxes.append((*centre, *half, heading, float(is_round)))
@@ -90,7 +95,9 @@ class _Builder:
             if self.is_free(x, y, a if is_round else math.hypot(a, b), gap):
                 h = self.uniform(*height) / 2
                 heading = self.uniform(0, math.pi / 2) if turned and not is_round else 0.0
-                self.add(centre=(x, y, h), half=(a, b, h), heading=heading, chart=self.chart(*charts), is_round=is_round)
+                self.add(
+                    centre=(x, y, h), half=(a, b, h), heading=heading, chart=self.chart(*charts), is_round=is_round
+                )
                 placed += 1
 
     def hang(self, count: int, charts: tuple[str, ...], *, depth: float = 0.02) -> None:
@@ -119,19 +126,8 @@ class _Builder:
         sky: int | None = None, movers: int = 0, panorama: Tensor | None = None,
     ) -> World:  # fmt: skip
         """Join everything into a world; the shell gets six faces, the sky one."""
-        length, width, height = self.size
-        first_mover = len(self.boxes) + 1
-        swings = [self._add_mover(k) for k in range(movers)]
-        boxes = torch.tensor([(0, 0, height / 2, length / 2, width / 2, height / 2, 0, 0), *self.boxes], dtype=torch.float64)
-        solids = Solids(
-            centre=boxes[:, :3].float(),
-            half=boxes[:, 3:6].float(),
-            heading=torch.stack([boxes[:, 6].cos(), boxes[:, 6].sin()], -1).float(),
-            is_round=boxes[:, 7] > 0,
-            open_above=sky is not None,
-        )
-        panorama_chart = -1
         images = [draw(material, self.generator) for material in self.materials]
+        panorama_chart = -1
         if panorama is not None:
             panorama_chart = len(images)
             images.append(panorama)
@@ -139,37 +135,49 @@ class _Builder:
                 shell = [(panorama_chart, (1.0, 1.0, 1.0))] * 6
             else:
                 sky = panorama_chart
-        looks = [*shell, *(look for solid in self.looks for look in solid)]
-        looks.append((0 if sky is None else sky, (1.0, 1.0, 1.0)))
-        rows = len(looks)
-        corner = torch.rand(2, rows, generator=self.generator) * torch.tensor([[WIDTH], [HEIGHT]])
-        density = self.texels_per_metre * (0.85 + 0.4 * torch.rand(rows, generator=self.generator))
-        density[:6], density[-1] = self.texels_per_metre, 140.0
+        place = self._places()
+        still = len(self.boxes)
+        swings = [self._add_mover(number) for number in range(movers)]
+        # movers are drawn last: the static world is the same with and without them
+        place = torch.cat([place, self._places()[len(place) :], torch.tensor([[0.0, 0.0, SKY_DENSITY]])])
+        length, width, height = self.size
+        boxes = torch.tensor([(0, 0, height / 2, length / 2, width / 2, height / 2, 0, 0), *self.boxes]).float()
+        solids = Solids(
+            centre=boxes[:, :3],
+            half=boxes[:, 3:6],
+            heading=torch.stack([boxes[:, 6].cos(), boxes[:, 6].sin()], -1),
+            is_round=boxes[:, 7] > 0,
+            open_above=sky is not None,
+        )
         c, s = solids.heading.mT[..., None]
-        x, y, z = NORMALS.mT
+        x, y, z = torch.tensor(NORMALS).mT
         normal = torch.stack([c * x - s * y, s * x + c * y, z.expand(len(boxes), 6)]).flatten(1)
         normal[:, :6] *= -1
-        faces = Faces(
-            chart=torch.tensor([float(chart) for chart, _ in looks]),
-            corner=corner,
-            density=density,
-            tint=torch.tensor([tint for _, tint in looks]).mT.contiguous(),
-            normal=torch.cat([normal, torch.zeros(3, 1)], 1),
-        )
-        return World(
-            name=name,
-            solids=solids,
-            faces=faces,
+        looks = [*shell, *(look for solid in self.looks for look in solid), (sky or 0, (1.0, 1.0, 1.0))]
+        surfaces = Surfaces(
+            faces=Faces(
+                chart=torch.tensor([float(chart) for chart, _ in looks]),
+                corner=place[:, :2].mT,
+                density=place[:, 2],
+                tint=torch.tensor([tint for _, tint in looks]).mT,
+                normal=torch.cat([normal, torch.zeros(3, 1)], 1),
+            ),
             atlas=TextureAtlas.of(torch.stack(images)),
             lamps=lamps,
             ambient=ambient,
-            walkway=self.walkway,
-            movers=tuple(
-                Mover(first_mover + k, swing, period_s=3.0 + k) for k, swing in enumerate(swings)
-            ),
             panorama_chart=panorama_chart,
             panorama_centre=(*self.walkway.centre, self.walkway.eye_height),
         )
+        found = tuple(Mover(still + 1 + k, swing, period_s=3.0 + k) for k, swing in enumerate(swings))
+        return World(name, solids, surfaces, self.walkway, found)
+
+    def _places(self) -> Tensor:
+        """Draw where in its chart each face of the shell and the solids lies, and its texels a metre."""
+        place = torch.rand(6 * (len(self.boxes) + 1), 3, generator=self.generator)
+        place *= torch.tensor([WIDTH, HEIGHT, 0.4 * self.texels_per_metre])
+        place[:, 2] += 0.85 * self.texels_per_metre
+        place[:6, 2] = self.texels_per_metre
+        return place
 
     def _add_mover(self, number: int) -> tuple[float, float, float]:
         """Add a box that swings along the walkway's tangent, inside it or outside it, and return its swing."""
@@ -187,9 +195,11 @@ def make_world(name: str, *, seed: int = 0, panorama: str | Path | None = None, 
     """Make one of the named worlds.
 
     Args:
-        name: `room` (7.5 x 6 x 2.8 m, furnished), `pillars` (a hall of 14 x 11 x 4 m) or `courtyard` (18 x 14 m, walls and sky).
+        name: `room` (7.5 x 6 x 2.8 m, furnished), `pillars` (a hall of 14 x 11 x 4 m) or `courtyard` (18 x 14 m, walls
+            of 3.6 m and sky).
         seed: Where things stand and what they look like.
-        panorama: An equirectangular image that the walls wear, or the sky where there is one; None for procedural looks.
+        panorama: An equirectangular image that the walls wear, or the sky where there is one; None for procedural
+            looks.
         moving_objects: Boxes that swing beside the walkway.
 
     Raises:
@@ -221,15 +231,13 @@ def _room(generator: torch.Generator, movers: int, panorama: Tensor | None) -> W
     b.place(4, ("collage", "mural"), radius=(0.1, 0.18), height=(0.3, 1.3), rounds=0.7)
     b.stack(6, ("collage", "mural", "planks"), most_height=1.0)
     b.hang(6, ("collage", "mural"))
-    plain, warm = b.chart("plaster"), b.chart("collage")
     shell = [
-        (plain, b.tint(0.75)), (b.chart("brick"), (1.0, 0.78, 0.66)), (b.chart("mural"), b.tint(0.6)),
-        (plain, b.tint(0.75)), (b.chart("planks"), (0.95, 0.9, 0.85)), (warm, (0.7, 0.7, 0.7)),
+        (b.chart("plaster"), b.tint(0.85)), (b.chart("brick"), (1.0, 0.78, 0.66)), (b.chart("mural"), b.tint(0.8)),
+        (b.chart("plaster"), b.tint(0.85)), (b.chart("stones"), (0.95, 0.95, 1.0)),
+        (b.chart("planks"), (0.95, 0.9, 0.85)),
     ]  # fmt: skip
-    # faces of the shell are named by the outside: row 4 is the ceiling, row 5 the floor
-    shell[4], shell[5] = (b.chart("stones"), (0.95, 0.95, 1.0)), shell[4]
     lamps = (Lamp((1.2, 0.8, 2.6), 0.75, 2.6), Lamp((-2.0, -1.2, 2.6), 0.55, 2.2))
-    return b.build("room", shell, lamps=lamps, ambient=0.42, movers=movers, panorama=panorama)
+    return b.build("room", shell, lamps=lamps, ambient=0.6, movers=movers, panorama=panorama)
 
 
 def _pillars(generator: torch.Generator, movers: int, panorama: Tensor | None) -> World:
@@ -241,11 +249,12 @@ def _pillars(generator: torch.Generator, movers: int, panorama: Tensor | None) -
     b.stack(5, ("collage", "mural"), most_height=1.3)
     b.hang(6, ("collage", "mural"))
     shell = [
-        (b.chart("brick"), (1.0, 0.85, 0.75)), (b.chart("plaster"), b.tint(0.75)), (b.chart("stones"), b.tint(0.75)),
-        (b.chart("brick"), (0.9, 0.9, 0.95)), (b.chart("mural"), (0.75, 0.75, 0.75)), (b.chart("paving"), (1.0, 0.97, 0.92)),
+        (b.chart("brick"), (1.0, 0.85, 0.75)), (b.chart("plaster"), b.tint(0.85)), (b.chart("stones"), b.tint(0.85)),
+        (b.chart("brick"), (0.9, 0.9, 0.95)), (b.chart("mural"), (0.75, 0.75, 0.75)),
+        (b.chart("paving"), (1.0, 0.97, 0.92)),
     ]  # fmt: skip
     lamps = (Lamp((3.0, 2.0, 3.8), 0.8, 4.5), Lamp((-3.5, -2.0, 3.8), 0.7, 4.0))
-    return b.build("pillars", shell, lamps=lamps, ambient=0.38, movers=movers, panorama=panorama)
+    return b.build("pillars", shell, lamps=lamps, ambient=0.62, movers=movers, panorama=panorama)
 
 
 def _courtyard(generator: torch.Generator, movers: int, panorama: Tensor | None) -> World:
@@ -260,10 +269,11 @@ def _courtyard(generator: torch.Generator, movers: int, panorama: Tensor | None)
         crown = b.uniform(0.5, 0.9)
         b.add(centre=(x, y, 2 * h), half=(crown, crown, 0.6), heading=b.uniform(0, 1.5), chart=b.chart("mural"))
     shell = [
-        (b.chart("brick"), (1.0, 0.8, 0.7)), (b.chart("stones"), b.tint(0.75)), (b.chart("brick"), (0.9, 0.9, 0.9)),
-        (b.chart("mural"), (0.85, 0.8, 0.75)), (b.chart("paving"), (1.0, 1.0, 1.0)), (b.chart("paving"), (1.0, 0.98, 0.95)),
+        (b.chart("brick"), (1.0, 0.8, 0.7)), (b.chart("stones"), b.tint(0.85)), (b.chart("brick"), (0.9, 0.9, 0.9)),
+        (b.chart("mural"), (0.85, 0.8, 0.75)), (b.chart("paving"), (1.0, 1.0, 1.0)),
+        (b.chart("paving"), (1.0, 0.98, 0.95)),
     ]  # fmt: skip
     # the sun stands far away: one lamp whose light hardly falls off
     lamps = (Lamp((60.0, 35.0, 80.0), 0.6, 1e4),)
     sky = b.chart("clouds")
-    return b.build("courtyard", shell, lamps=lamps, ambient=0.5, sky=sky, movers=movers, panorama=panorama)
+    return b.build("courtyard", shell, lamps=lamps, ambient=0.62, sky=sky, movers=movers, panorama=panorama)

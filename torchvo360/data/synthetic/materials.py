@@ -3,7 +3,7 @@
 from collections.abc import Callable
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from torchvo360.data.synthetic.texture import HEIGHT, WIDTH
@@ -26,7 +26,9 @@ def draw(name: str, generator: torch.Generator) -> Chart:
     return recipes[name](generator).clamp(0, 1)
 
 
-def _noise(generator: torch.Generator, slope: float, *, channels: int = 1, stretch: float = 1.0) -> Float[Tensor, "C H W"]:
+def _noise(
+    generator: torch.Generator, slope: float, *, channels: int = 1, stretch: float = 1.0
+) -> Float[Tensor, "C H W"]:
     """Return periodic noise of mean 0 and deviation 1 with the amplitude spectrum f^-slope.
 
     Args:
@@ -44,14 +46,11 @@ def _noise(generator: torch.Generator, slope: float, *, channels: int = 1, stret
     return field / field.std((-2, -1), keepdim=True)
 
 
-def _grid() -> tuple[Float[Tensor, "H W"], Float[Tensor, "H W"]]:
+def _cells(
+    generator: torch.Generator, width: int, height: int, *, bond: int = 0, gap: int = 1
+) -> tuple[Float[Tensor, "H W"], Bool[Tensor, "H W"]]:
+    """Return a value for each block of a wall, every second row shifted by `bond`, and where the joints are."""
     v, u = torch.meshgrid(torch.arange(HEIGHT), torch.arange(WIDTH), indexing="ij")
-    return u, v
-
-
-def _cells(generator: torch.Generator, width: int, height: int, *, bond: int = 0, gap: int = 1) -> tuple[Tensor, Tensor]:
-    """Return a value in [0, 1] for each block of a wall, every second row shifted by `bond`, and where the joints are."""
-    u, v = _grid()
     row = v // height
     shifted = (u + (row % 2) * bond) % WIDTH
     values = torch.rand(HEIGHT // height, WIDTH // width, generator=generator)
@@ -86,8 +85,9 @@ def _paving(generator: torch.Generator) -> Chart:
 
 
 def _mural(generator: torch.Generator) -> Chart:
-    blobs = torch.tanh(2.5 * _noise(generator, 1.35, channels=3))
-    return 0.5 + 0.27 * blobs + 0.06 * _noise(generator, 0.8)
+    blobs = torch.tanh(2.5 * _noise(generator, 1.3))
+    colours = torch.tanh(2.0 * _noise(generator, 1.5, channels=3))
+    return 0.55 + 0.2 * blobs + 0.11 * colours + 0.05 * _noise(generator, 0.8)
 
 
 def _collage(generator: torch.Generator) -> Chart:
@@ -98,7 +98,8 @@ def _collage(generator: torch.Generator) -> Chart:
     side = (6.0**-2 + torch.rand(count, 2, generator=generator) * (220.0**-2 - 6.0**-2)) ** -0.5
     side = side[side.prod(-1).argsort(descending=True)].long().tolist()
     corner = torch.rand(count, 2, generator=generator) * torch.tensor([WIDTH, HEIGHT])
-    colour = 0.1 + 0.8 * torch.rand(count, 3, 1, 1, generator=generator)
+    grey, hue = 0.15 + 0.7 * torch.rand(count, 1, generator=generator), torch.rand(count, 3, generator=generator)
+    colour = (grey + 0.35 * (hue - 0.5))[..., None, None]
     for k, ((w, h), (u, v)) in enumerate(zip(side, corner.long().tolist(), strict=True)):
         rows = torch.arange(v, v + h) % HEIGHT
         columns = torch.arange(u, u + w) % WIDTH
@@ -112,21 +113,23 @@ def _stones(generator: torch.Generator) -> Chart:
     rows, columns = HEIGHT // size, WIDTH // size
     jitter = torch.rand(rows, columns, 2, generator=generator)
     value = torch.rand(rows, columns, generator=generator)
-    u, v = _grid()
+    v, u = torch.meshgrid(torch.arange(HEIGHT) % size, torch.arange(WIDTH) % size, indexing="ij")
     nearest = torch.full((HEIGHT, WIDTH), torch.inf)
     second, shade = nearest.clone(), torch.zeros(HEIGHT, WIDTH)
     for dv in (-1, 0, 1):
         for du in (-1, 0, 1):
-            row, column = v // size + dv, u // size + du
-            at = jitter[row % rows, column % columns]
-            distance = torch.hypot((column + at[..., 0]) * size - u, (row + at[..., 1]) * size - v)
+            there = torch.stack([jitter[..., 0] + du, jitter[..., 1] + dv, value]).roll((-dv, -du), (-2, -1))
+            across, down, its_shade = there.repeat_interleave(size, -1).repeat_interleave(size, -2)
+            distance = torch.hypot(across * size - u, down * size - v)
             closer = distance < nearest
             second = torch.where(closer, nearest, torch.minimum(second, distance))
-            shade = torch.where(closer, value[row % rows, column % columns], shade)
+            shade = torch.where(closer, its_shade, shade)
             nearest = torch.where(closer, distance, nearest)
     joint = ((second - nearest) / 4).clamp(0, 1)
-    return joint * (0.3 + 0.45 * shade + 0.08 * _noise(generator, 0.9)) + (1 - joint) * 0.2 + 0.05 * _noise(
-        generator, 1.4, channels=3
+    return (
+        joint * (0.3 + 0.45 * shade + 0.08 * _noise(generator, 0.9))
+        + (1 - joint) * 0.2
+        + 0.05 * _noise(generator, 1.4, channels=3)
     )
 
 

@@ -33,13 +33,17 @@ class RayGroups:
     angle: Float[Tensor, "G"]
     """Half opening of each group's cone, radians."""
 
+    def __getitem__(self, part: slice) -> "RayGroups":
+        """Return some of the groups."""
+        return RayGroups(self.ray[:, part], self.length[part], self.spread[part], self.axis[:, part], self.angle[part])
+
     @classmethod
     def of(cls, ray: Float[Tensor, "G R 3"], pixel: Float[Tensor, "G R"]) -> "RayGroups":
         """Group rays [G, R, 3] whose pixels have the angular size `pixel`, radians."""
         length = torch.linalg.vector_norm(ray, dim=-1)
         unit = ray / length[..., None]
         axis = F.normalize(unit.mean(1), dim=-1)
-        # 1e-6: sine of the angle by the chord, with room for rounding
+        # the angle by its chord, which keeps its digits at small angles; 1e-4 for the rounding
         half_chord = torch.linalg.vector_norm(unit - axis[:, None], dim=-1).amax(1) / 2
         angle = 2 * torch.asin(half_chord.clamp_max(1.0)) + 1e-4
         return cls(ray.permute(2, 0, 1).contiguous(), length, pixel * length, axis.mT.contiguous(), angle)

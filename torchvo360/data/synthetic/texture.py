@@ -1,8 +1,9 @@
 """Texture charts and their filtered look-up.
 
-A chart is a periodic colour image of WIDTH x HEIGHT texels. All charts of a world lie one after another in one table with
-their mip levels (each halves both sizes), so that one weighted gather reads every surface of a frame. The look-up is
-trilinear: what a pixel sees is band-limited at every distance, and the gradient that direct alignment lives on is no alias.
+A chart is a periodic colour image of WIDTH x HEIGHT texels. All charts of a world lie one after another in one table
+with their mip levels (each halves both sizes), so that one weighted gather reads every surface of a frame. The look-up
+is trilinear: what a pixel sees is band-limited at every distance, and the gradient that direct alignment lives on is no
+alias.
 """
 
 from dataclasses import dataclass
@@ -16,6 +17,9 @@ LOG2_WIDTH, LOG2_HEIGHT = 10, 9
 WIDTH, HEIGHT = 1 << LOG2_WIDTH, 1 << LOG2_HEIGHT
 LEVELS = 9
 """Levels of a chart: the last has 4 x 2 texels."""
+SOFTNESS = 0.8
+"""Texel of the level read, as a share of the footprint. At 1 fine texture is lost; at 0.5 pixels are the exact mean over
+their area, and a bilinear look-up from one frame into the next is three times further off (0.008 instead of 0.0026)."""
 
 
 @dataclass(frozen=True)
@@ -47,7 +51,7 @@ class TextureAtlas:
             v: Centre of the footprint downwards, likewise.
             width: Diameter of the footprint, in texels of level 0.
         """
-        lod = width.clamp_min(1.0).log2_().clamp_max_(LEVELS - 1.01)
+        lod = (SOFTNESS * width).clamp_min_(1.0).log2_().clamp_max_(LEVELS - 1.01)
         fine = lod.floor()
         blend = lod.sub_(fine)
         level, number = fine.int(), chart.int()
@@ -83,7 +87,7 @@ class TextureAtlas:
 
 def _halved(image: Float[Tensor, "K 3 H W"]) -> Float[Tensor, "K 3 H2 W2"]:
     """Halve periodic images with the separable filter [1 3 3 1] / 8, which leaves little alias on the next level."""
-    k = torch.tensor([1.0, 3.0, 3.0, 1.0], device=image.device) / 8
-    wide = F.conv2d(F.pad(image.flatten(0, 1)[:, None], (1, 1, 0, 0), mode="circular"), k.view(1, 1, 1, 4), stride=(1, 2))
-    both = F.conv2d(F.pad(wide, (0, 0, 1, 1), mode="circular"), k.view(1, 1, 4, 1), stride=(2, 1))
-    return both.view(*image.shape[:2], *both.shape[-2:])
+    for axis in (-1, -2):
+        even, odd = image.unflatten(axis, (-1, 2)).unbind(axis)
+        image = (3 * (even + odd) + odd.roll(1, axis) + even.roll(-1, axis)) / 8
+    return image

@@ -1,0 +1,37 @@
+"""Do two aligned images agree? It tells a false minimum from a true one without knowing the truth."""
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from torchvo360.residuals.direct import Reference, Target, look_up
+
+TOLERANCE_PX = 0.5
+"""A residual agrees if a displacement of this many pixels along the gradient would explain it."""
+
+
+def agreement(
+    reference: Reference, target: Target, T_tgt_ref: Float[Tensor, "B 4 4"], affine: Float[Tensor, "B 2"]
+) -> Float[Tensor, "B"]:
+    """Return the share of the target's gradient energy whose residuals are smaller than half a pixel's displacement.
+
+    Residuals are measured by the gradient they stand on, so that neither exposure, nor contrast, nor smooth areas count.
+    True alignments of real and rendered images reach 0.8 to 0.95, false minima 0.15 to 0.35 (docs/decisions.md).
+
+    Args:
+        reference: Points.
+        target: Images.
+        T_tgt_ref: Solutions, float64.
+        affine: (a, b), float64.
+
+    Returns:
+        Between 0 and 1; 0 where the images have no gradient or no point is seen.
+    """
+    dtype = reference.value.dtype
+    samples = look_up(reference, target, T_tgt_ref.to(dtype), affine.to(dtype))
+    Gx, Gy, Gz = samples.G
+    slope2 = (Gx * Gx + Gy * Gy + Gz * Gz) * target.camera.pixel_angle**2
+    energy = samples.weight * slope2
+    explained = energy * (samples.residual**2 < TOLERANCE_PX**2 * slope2)
+    total = energy.sum((1, 2))
+    return explained.sum((1, 2)) / total.clamp_min(torch.finfo(dtype).tiny)

@@ -1,0 +1,126 @@
+"""Paths through a world's free space: smooth, and known in closed form at any time.
+
+The world is z up. An upright camera looks along its heading with x to the right and y down.
+"""
+
+import math
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float64
+from torch import Tensor
+
+from torchvo360.checks import check_choice
+from torchvo360.data.synthetic.world import Walkway
+from torchvo360.lie import se3, so3_exp
+
+MOTIONS = ("walk", "loop", "rotation", "still")
+SPEED = 0.95
+"""Walking speed, metres a second."""
+STEPS_HZ = 1.8
+"""Steps a second; the sway goes once from left to right every second step."""
+UPRIGHT = torch.tensor([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]], dtype=torch.float64)
+"""R_world_cam of a level camera that looks along the world's x axis."""
+
+
+@dataclass(frozen=True)
+class Sway:
+    """Seeded phases of the slow wander and of the gait."""
+
+    phase: Float64[Tensor, "12"]
+
+    @classmethod
+    def of(cls, generator: torch.Generator) -> "Sway":
+        """Draw the phases."""
+        return cls(torch.rand(12, generator=generator, dtype=torch.float64) * math.tau)
+
+    def wave(self, k: int, angle: Float64[Tensor, "N"]) -> Float64[Tensor, "N"]:
+        """Return the k-th sine."""
+        return torch.sin(angle + self.phase[k])
+
+
+def trajectory(
+    motion: str, walkway: Walkway, frames: int, fps: float, *, seed: int = 0, yaw_jump_deg: float = 0.0
+) -> Float64[Tensor, "N 4 4"]:
+    """Return the poses T_world_cam of a motion.
+
+    Args:
+        motion: `walk` (along the walkway at 0.95 m/s with bob, sway and wander), `loop` (once around the walkway, the
+            frame after the last would be the first), `rotation` (about a fixed point) or `still`.
+        walkway: The free curve of the world.
+        frames: Number of poses.
+        fps: Frames a second.
+        seed: Start, direction and phases.
+        yaw_jump_deg: Extra turn to the left about the vertical inside the two frames at the middle.
+
+    Raises:
+        InputError: The motion is another word.
+    """
+    check_choice("motion", motion, MOTIONS)
+    generator = torch.Generator().manual_seed(seed)
+    start = math.tau * float(torch.rand((), generator=generator, dtype=torch.float64))
+    direction = 1.0 if float(torch.rand((), generator=generator)) < 0.5 else -1.0
+    sway = Sway.of(generator)
+    index = torch.arange(frames, dtype=torch.float64)
+    time = index / fps
+    still = torch.zeros_like(time)
+    if motion == "still":
+        position, yaw, pitch, roll = _upright_at(walkway, start + still), start + still, still, still
+    elif motion == "rotation":
+        position = _upright_at(walkway, start + still)
+        yaw = start + direction * (0.5 * time + 0.15 * sway.wave(0, 1.9 * time))
+        pitch = 0.2 * (sway.wave(1, 1.3 * time) - sway.wave(1, still))
+        roll = 0.12 * (sway.wave(2, 1.7 * time) - sway.wave(2, still))
+    else:
+        if motion == "loop":
+            # Every wave closes with the loop: a whole number of periods in `frames` frames.
+            turn = index / frames
+            wander, gait = math.tau * turn, math.tau * turn * max(1, round(frames / fps * STEPS_HZ / 2))
+            distance = turn * _circumference(walkway)
+        else:
+            wander, gait = 0.9 * time, math.tau * STEPS_HZ / 2 * time
+            distance = SPEED * time
+        angle = start + direction * _angle_at(walkway, start, direction, distance)
+        position = _upright_at(walkway, angle)
+        a, b = walkway.radii
+        tangent = torch.stack([-a * angle.sin(), b * angle.cos()], -1) * direction
+        heading = torch.atan2(tangent[:, 1], tangent[:, 0])
+        left = torch.stack([-heading.sin(), heading.cos(), still], -1)
+        position = position + left * (0.02 * sway.wave(0, gait) + 0.04 * sway.wave(1, 2 * wander))[:, None]
+        position[:, 2] += 0.022 * sway.wave(2, 2 * gait) + 0.06 * sway.wave(3, wander)
+        yaw = heading + 0.2 * sway.wave(4, 2 * wander) + 0.02 * sway.wave(5, gait)
+        pitch = 0.08 * sway.wave(6, wander) + 0.012 * sway.wave(7, 2 * gait)
+        roll = 0.05 * sway.wave(8, wander) + 0.015 * sway.wave(9, gait)
+    middle = frames // 2
+    yaw = yaw + math.radians(yaw_jump_deg) * ((index - middle + 1) / 2).clamp(0, 1)
+    return se3(_attitude(yaw, pitch, roll), position)
+
+
+def _attitude(
+    yaw: Float64[Tensor, "N"], pitch: Float64[Tensor, "N"], roll: Float64[Tensor, "N"]
+) -> Float64[Tensor, "N 3 3"]:
+    """Return R_world_cam of a camera turned left by yaw, then up by pitch, then by roll about its view, radians."""
+    x, _, z = torch.eye(3, dtype=yaw.dtype)
+    return so3_exp(yaw[:, None] * z) @ UPRIGHT @ so3_exp(pitch[:, None] * x) @ so3_exp(roll[:, None] * z)
+
+
+def _upright_at(walkway: Walkway, angle: Float64[Tensor, "N"]) -> Float64[Tensor, "N 3"]:
+    (x, y), (a, b) = walkway.centre, walkway.radii
+    return torch.stack([x + a * angle.cos(), y + b * angle.sin(), torch.full_like(angle, walkway.eye_height)], -1)
+
+
+def _circumference(walkway: Walkway) -> float:
+    angle = torch.linspace(0, math.tau, 4097, dtype=torch.float64)
+    return float(torch.linalg.vector_norm(_upright_at(walkway, angle).diff(dim=0), dim=-1).sum())
+
+
+def _angle_at(walkway: Walkway, start: float, direction: float, distance: Float64[Tensor, "N"]) -> Float64[Tensor, "N"]:
+    """Return the angle gone after a distance along the ellipse, by its arc length at 4096 steps a turn."""
+    whole = _circumference(walkway)
+    turn = torch.linspace(0, math.tau, 4097, dtype=torch.float64)
+    step = torch.linalg.vector_norm(_upright_at(walkway, start + direction * turn).diff(dim=0), dim=-1)
+    gone = torch.cat([step.new_zeros(1), step.cumsum(0)])
+    within = distance % whole
+    k = torch.searchsorted(gone, within, right=True).clamp(1, len(gone) - 1)
+    share = (within - gone[k - 1]) / (gone[k] - gone[k - 1])
+    return turn[k - 1] + share * (turn[k] - turn[k - 1]) + math.tau * torch.floor(distance / whole)

@@ -1,0 +1,6 @@
+"""Depth from motion: epipolar search and the inverse-range filter."""
+
+from torchvo360.depth.epipolar import EpipolarConfig, EpipolarMatch, search_great_circles
+from torchvo360.depth.filter import FilterConfig, InverseRange, fuse, smooth
+
+__all__ = ["EpipolarConfig", "EpipolarMatch", "FilterConfig", "InverseRange", "fuse", "search_great_circles", "smooth"]

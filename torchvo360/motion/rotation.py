@@ -1,0 +1,148 @@
+"""Rotation between two panoramas without any depth: a global search over SO(3), refined by direct alignment.
+
+At 64 x 32 pixels the whole group costs one batched look-up of some 950 rotations; the best few are refined together.
+"""
+
+import math
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from torchvo360 import lie
+from torchvo360.backends import linearize
+from torchvo360.image import sample
+from torchvo360.residuals.direct import Reference, Target
+from torchvo360.residuals.normal import NormalEquations
+from torchvo360.residuals.weights import LossConfig
+from torchvo360.solve import LMConfig, Solution, minimize
+
+ROTATION_AND_BRIGHTNESS = (False, False, False, True, True, True, True, True)
+REFINED = 16
+"""Candidates of the global search that are refined."""
+
+
+@dataclass(frozen=True)
+class RotationResult:
+    """Rotations R_tgt_ref with the robust cost of each, the best first."""
+
+    R_tgt_ref: Float[Tensor, "K 3 3"]
+    affine: Float[Tensor, "K 2"]
+    cost: Float[Tensor, "K"]
+
+
+def rotation_grid(step_rad: float) -> Float[Tensor, "M 3 3"]:
+    """Cover SO(3): every rotation is within about `step_rad` of one of these.
+
+    Directions spread evenly over the sphere by a golden spiral, each with equal steps of roll about it.
+    """
+    directions = max(1, round(4 * math.pi / step_rad**2))
+    k = torch.arange(directions, dtype=torch.float64)
+    height = 1 - (2 * k + 1) / directions
+    lon = k * (math.pi * (3 - math.sqrt(5)))
+    # The rotation that takes the vertical axis to each direction by the shortest way.
+    angle = torch.acos(height)
+    axis = torch.stack([lon.cos(), torch.zeros_like(lon), -lon.sin()], -1)
+    tilt = lie.so3_exp(axis * angle[:, None])
+    rolls = max(1, round(math.tau / step_rad))
+    roll = torch.arange(rolls, dtype=torch.float64) * (math.tau / rolls)
+    about = lie.so3_exp(torch.stack([torch.zeros_like(roll), roll, torch.zeros_like(roll)], -1))
+    return (tilt[:, None] @ about).flatten(0, 1)
+
+
+def align_rotation(
+    reference: Reference,
+    target: Target,
+    R_tgt_ref: Float[Tensor, "K 3 3"],
+    *,
+    max_steps: int = 20,
+    loss: LossConfig | None = None,
+) -> RotationResult:
+    """Refine rotations and brightness from K starts in one batch; the points are taken at infinity.
+
+    Args:
+        reference: Points of one reference (batch 1).
+        target: One target image (batch 1).
+        R_tgt_ref: Starts, float64.
+        max_steps: Most steps of the solver.
+        loss: The robust loss.
+    """
+    K = R_tgt_ref.shape[0]
+    loss = LossConfig() if loss is None else loss
+    index = torch.zeros(K, dtype=torch.int64, device=R_tgt_ref.device)
+    points = Reference(
+        reference.ray, torch.zeros_like(reference.rho)[index], reference.value[index], reference.weight[index]
+    )
+    images = target.take(index)
+
+    def evaluate(state: tuple[Tensor, ...], active: Tensor) -> NormalEquations:
+        T, affine = state
+        return linearize(points.take(active), images.take(active), T, affine, loss)
+
+    def retract(state: tuple[Tensor, ...], delta: Tensor) -> tuple[Tensor, ...]:
+        return lie.se3_exp(delta[:, :6]) @ state[0], state[1] + delta[:, 6:]
+
+    free = torch.tensor(ROTATION_AND_BRIGHTNESS, device=R_tgt_ref.device)
+    scale = torch.full((K, 8), 1 / target.camera.pixel_angle, dtype=torch.float64, device=R_tgt_ref.device)
+    solution: Solution = minimize(
+        evaluate,
+        retract,
+        (lie.se3(R_tgt_ref, R_tgt_ref.new_zeros(K, 3)), R_tgt_ref.new_zeros(K, 2)),
+        LMConfig(max_steps=max_steps, cost_tolerance=1e-3),
+        step_scale=scale * free,
+        free=free,
+        min_weight=1.0,
+    )
+    cost = solution.equations.cost / solution.equations.weight.clamp_min(1e-9)
+    order = cost.argsort(stable=True)
+    return RotationResult(solution.state[0][order, :3, :3], solution.state[1][order], cost[order])
+
+
+def search_rotation(
+    reference: Reference,
+    target: Target,
+    grid: Float[Tensor, "M 3 3"],
+    *,
+    refined: int = REFINED,
+) -> RotationResult:
+    """Find the rotation between two small panoramas wherever it is on SO(3).
+
+    Every grid rotation is scored by the normalised cross-correlation of the images, and the best are refined.
+
+    Args:
+        reference: Points of the reference (batch 1), for instance all pixels of a 64 x 32 level.
+        target: The target image (batch 1) of that level.
+        grid: Rotations R_tgt_ref to try, for instance `rotation_grid(0.6)`.
+        refined: How many of the best are refined.
+    """
+    dtype = reference.value.dtype
+    directions = torch.einsum("mij,jn->mni", grid.to(dtype), reference.ray[0])
+    inside = target.padded[..., 1:-1, 1:-1]
+    value = sample(inside, target.camera.pixel(directions).flatten(0, 1)[None], target.camera)[0, 0]
+    value = value.view(grid.shape[0], -1)
+    weight = reference.weight / reference.weight.sum().clamp_min(1e-9)
+    known = reference.value[0, :1]
+    centred = known - (weight * known).sum()
+    value = value - (weight * value).sum(-1, keepdim=True)
+    spread = (weight * value.square()).sum(-1) * (weight * centred.square()).sum()
+    correlation = (weight * value * centred).sum(-1) / spread.clamp_min(1e-12).sqrt()
+    best = correlation.topk(min(refined, grid.shape[0])).indices
+    return align_rotation(reference, target, grid[best])
+
+
+def fit_rotation(
+    ref: Float[Tensor, "N 3"], tgt: Float[Tensor, "N 3"], start: Float[Tensor, "3 3"]
+) -> Float[Tensor, "3 3"]:
+    """Return the rotation that best takes bearings to their matches, robustly, from a start.
+
+    Iteratively reweighted Kabsch: parallax and bad tracks are outliers.
+    """
+    R = start
+    for _ in range(8):
+        error = torch.linalg.vector_norm(ref @ R.mT - tgt, dim=-1)
+        weight = 1 / (error.square() + error.median().square().clamp_min(1e-8))
+        U, _, Vh = torch.linalg.svd(tgt.mT @ (ref * weight[:, None]))
+        sign = torch.linalg.det(U @ Vh).sign()
+        R = U @ torch.diag(torch.stack([torch.ones_like(sign), torch.ones_like(sign), sign])) @ Vh
+    return R

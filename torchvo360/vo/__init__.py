@@ -1,0 +1,7 @@
+"""Visual odometry: from frames to poses and a map."""
+
+from torchvo360.vo.map import PointCloud
+from torchvo360.vo.state import FrameEstimate, State
+from torchvo360.vo.system import OdometryConfig, OdometryResult, VisualOdometry
+
+__all__ = ["FrameEstimate", "OdometryConfig", "OdometryResult", "PointCloud", "State", "VisualOdometry"]

@@ -1,0 +1,85 @@
+"""A frame made ready: grey image, pyramid and padded targets; what is the same for all frames is made once."""
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, UInt8
+from torch import Tensor
+
+from torchvo360.cameras import Camera
+from torchvo360.image import blur, gradient_magnitude, level_camera, pad_image, resample
+from torchvo360.residuals.direct import Target
+
+
+@dataclass(frozen=True)
+class PyramidFrame:
+    """One frame as tracking and mapping see it."""
+
+    index: int
+    t_ns: int
+    grey: UInt8[np.ndarray, "H W"]
+    """For corners."""
+    colour: UInt8[np.ndarray, "H W 3"]
+    """For the map's points."""
+    targets: list[Target]
+    """Smoothed grey levels in [0, 1], the finest first, padded for look-up; batch 1, one channel."""
+
+    @property
+    def image(self) -> Float[Tensor, "H W"]:
+        """The finest level without its padding."""
+        return self.targets[0].padded[0, 0, 1:-1, 1:-1]
+
+
+class FrameBuilder:
+    """Builds frames of one camera: level cameras, masks and ray grids are made once."""
+
+    def __init__(
+        self,
+        camera: Camera,
+        levels: int,
+        blur_px: float,
+        mask: Bool[Tensor, "H W"] | None,
+        saturation: float,
+        device: torch.device | str = "cpu",
+    ) -> None:
+        self.cameras = [level_camera(camera, level) for level in range(levels)]
+        self.blur_px, self.saturation, self.device = blur_px, saturation, torch.device(device)
+        self.mask = torch.ones(camera.height, camera.width, dtype=torch.bool) if mask is None else mask
+        self.mask = self.mask.to(self.device)
+        self._confidence = self._masked_levels() if mask is not None else [None] * levels
+        self._rays = self.cameras[0].ray_grid(device=self.device)
+
+    def _masked_levels(self) -> list[Tensor]:
+        share = self.mask.to(torch.float32)
+        levels = []
+        for camera in self.cameras:
+            share = resample(share, camera)
+            levels.append(pad_image((share > 0.99).to(torch.float32)[None, None], camera, 1).contiguous())
+        return levels
+
+    def build(self, colour: UInt8[np.ndarray, "H W 3"], index: int, t_ns: int) -> PyramidFrame:
+        """Return the frame of a colour image."""
+        grey = cv2.cvtColor(colour, cv2.COLOR_RGB2GRAY)
+        level = torch.from_numpy(grey).to(self.device, torch.float32).mul_(1 / 255)
+        level = blur(level, self.cameras[0], self.blur_px)
+        targets = []
+        for camera, confidence in zip(self.cameras, self._confidence, strict=True):
+            level = resample(level, camera)
+            padded = pad_image(level[None, None], camera, 1).contiguous()
+            targets.append(Target(camera, padded, confidence, self.saturation))
+        return PyramidFrame(index, t_ns, grey, colour, targets)
+
+    def strength(self, frame: PyramidFrame) -> Float[Tensor, "H W"]:
+        """Return the gradient magnitude of the finest level, intensity per pixel."""
+        return gradient_magnitude(frame.image, self.cameras[0], self._rays)
+
+    def usable(self, frame: PyramidFrame) -> Bool[Tensor, "H W"]:
+        """Return the pixels that may become points: unmasked and not clipped."""
+        return self.mask & (frame.image < self.saturation)
+
+    def rays(self, pixel: Tensor) -> Float[Tensor, "3 N"]:
+        """Return unit rays of flat pixels of the finest level, so that rho is the inverse distance for every camera."""
+        ray = self._rays.view(-1, 3)[pixel]
+        return (ray / torch.linalg.vector_norm(ray, dim=-1, keepdim=True)).T.contiguous()

@@ -1,0 +1,138 @@
+"""Tracking: a frame's pose against a keyframe's points, from a batch of hypotheses, coarse to fine."""
+
+from dataclasses import dataclass, field
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Float64, Int64
+from torch import Tensor
+
+from torchvo360.agreement import agreement
+from torchvo360.alignment import AlignConfig, solve_level
+from torchvo360.checks import InputError
+from torchvo360.residuals.direct import Reference, look_up
+from torchvo360.residuals.weights import LossConfig
+from torchvo360.solve import LMConfig
+from torchvo360.vo.frame import PyramidFrame
+from torchvo360.vo.map import Keyframe
+
+
+@dataclass(kw_only=True)
+class TrackConfig:
+    """Settings of tracking."""
+
+    points_by_level: list[int] = field(default_factory=lambda: [3000, 3000, 1500, 800])
+    """Most points at each level, the finest first; the last entry serves all coarser ones."""
+    steps_by_level: list[int] = field(default_factory=lambda: [12, 12, 12, 10])
+    noise: float = 4 / 255
+    """Standard deviation of an intensity, against which the variance of inverse ranges is weighed."""
+    huber: float = 7.4 / 255
+    """Residual at which the cost turns linear."""
+    cutoff: float = 34 / 255
+    """Residuals beyond this weigh nothing, but on the coarsest level all count."""
+    solver: LMConfig = field(default_factory=lambda: LMConfig(cost_tolerance=1e-3, step_tolerance=0.02))
+    min_points: int = 60
+    """Fewer trusted points cannot be tracked."""
+
+    def __post_init__(self) -> None:
+        for name in ("points_by_level", "steps_by_level"):
+            values = getattr(self, name)
+            if not values or min(values) < 1:
+                raise InputError(f"{name}: expected positive numbers, got {values}.")
+
+    def align_config(self, coarsest: bool) -> AlignConfig:
+        """Return the settings of one level's solve."""
+        loss = LossConfig(scale=self.huber, cutoff=None if coarsest else self.cutoff)
+        return AlignConfig(loss=loss, noise=self.noise, solver=self.solver, min_pixels=self.min_points // 2)
+
+
+class Track(NamedTuple):
+    """Where a frame was found."""
+
+    T_cam_key: Float64[Tensor, "4 4"]
+    affine: Float64[Tensor, "2"]
+    residual: float
+    inliers: float
+
+
+def _thinned(index: Int64[Tensor, "N"], count: int) -> Int64[Tensor, "M"]:
+    """Return `count` of the indices in even steps: pixels are in order, so that they stay spread over the sphere."""
+    if index.numel() <= count:
+        return index
+    return index[torch.arange(count, device=index.device) * index.numel() // count]
+
+
+def _reference(key: Keyframe, level: int, index: Int64[Tensor, "N"], B: int) -> Reference:
+    rho, variance, _ = key.points
+    ray = key.ray[:, index]
+    # Points are equal-area already: a further weight by solid angle would count it twice.
+    return Reference(
+        ray=ray[None],
+        rho=rho[index].expand(B, -1),
+        value=key.values[level][index].expand(B, 1, -1),
+        weight=torch.ones_like(rho[index]).expand(B, -1),
+        variance=variance[index].expand(B, -1),
+    )
+
+
+def track(
+    key: Keyframe,
+    frame: PyramidFrame,
+    T_cam_key: Float64[Tensor, "K 4 4"],
+    affine: Float64[Tensor, "2"],
+    config: TrackConfig,
+    max_relative_variance: float,
+) -> Track | None:
+    """Find a frame's pose against a keyframe.
+
+    All hypotheses are solved together on the coarsest level; the best goes on to the finer ones.
+
+    Args:
+        key: The keyframe.
+        frame: The frame.
+        T_cam_key: Hypotheses.
+        affine: Brightness (a, b) to start from.
+        config: Settings.
+        max_relative_variance: Points with V / rho^2 below this are used.
+
+    Returns:
+        The track, or None where the keyframe has too few points or no solve succeeded.
+    """
+    usable = key.trusted(max_relative_variance).nonzero()[:, 0]
+    if usable.numel() < config.min_points:
+        return None
+    T, ab = T_cam_key, affine.expand(T_cam_key.shape[0], 2)
+    levels = len(frame.targets)
+    for level in range(levels - 1, -1, -1):
+        count = config.points_by_level[min(level, len(config.points_by_level) - 1)]
+        steps = config.steps_by_level[min(level, len(config.steps_by_level) - 1)]
+        B = T.shape[0]
+        reference = _reference(key, level, _thinned(usable, count), B)
+        target = frame.targets[level]
+        if B > 1:
+            target = target.take(torch.zeros(B, dtype=torch.int64, device=T.device))
+        solution = solve_level(reference, target, T, ab, config.align_config(level == levels - 1), max_steps=steps)
+        cost = solution.equations.cost / solution.equations.weight
+        best = int(cost.nan_to_num(nan=torch.inf).argmin())
+        if not bool(torch.isfinite(cost[best])):
+            return None
+        T, ab = solution.state[0][best : best + 1], solution.state[1][best : best + 1]
+    return measure(key, frame, T[0], ab[0], _thinned(usable, config.points_by_level[0]))
+
+
+def measure(
+    key: Keyframe,
+    frame: PyramidFrame,
+    T_cam_key: Float64[Tensor, "4 4"],
+    affine: Float64[Tensor, "2"],
+    index: Int64[Tensor, "N"],
+) -> Track:
+    """Return a pose with its mean absolute residual and its agreement on the finest level."""
+    reference = _reference(key, 0, index, 1)
+    samples = look_up(
+        reference, frame.targets[0], T_cam_key[None].to(reference.value.dtype), affine[None].to(reference.value.dtype)
+    )
+    weight = samples.weight.sum().clamp_min(1e-9)
+    residual = float((samples.residual.abs() * samples.weight).sum() / weight)
+    inliers = float(agreement(reference, frame.targets[0], T_cam_key[None], affine[None])[0])
+    return Track(T_cam_key, affine, residual, inliers)

@@ -148,6 +148,12 @@ def se3_inverse(T: Float[Tensor, "*batch 4 4"]) -> Float[Tensor, "*batch 4 4"]:
     return se3(R_inv, -(R_inv @ T[..., :3, 3:])[..., 0])
 
 
+def se3_normalized(T: Float[Tensor, "*batch 4 4"]) -> Float[Tensor, "*batch 4 4"]:
+    """Return T with its rotation brought back to SO(3): products of products drift away from it exponentially."""
+    check_shape("T", T, "... 4 4")
+    return se3(matrix_from_quaternion(quaternion_from_matrix(T[..., :3, :3])), T[..., :3, 3])
+
+
 def se3_adjoint(T: Float[Tensor, "*batch 4 4"]) -> Float[Tensor, "*batch 6 6"]:
     """Return Ad with `T @ exp(xi) @ T^-1 == exp(Ad @ xi)`: [[R, hat(t) R], [0, R]] (equations.md, section 6)."""
     check_shape("T", T, "... 4 4")

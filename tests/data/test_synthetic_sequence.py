@@ -162,6 +162,7 @@ def test_noise_has_its_deviation_and_differs_between_frames(plain):
         ({"motion": "fly"}, "motion: expected one of walk, loop, rotation, still, got 'fly'."),
         ({"exposure": "auto"}, "exposure: expected one of constant, steps, drift, got 'auto'."),
         ({"frames": 0}, "frames: expected an integer of at least 1, got 0."),
+        ({"seed": 2**32}, "seed: expected at most 4294967295, got 4294967296."),
         ({"frames": 2.5}, "frames: expected an integer of at least 1, got 2.5."),
         ({"width": 300, "height": 200}, "width: expected twice the height for a panorama, got 300 x 200."),
         ({"fps": 0.0}, "fps: expected a finite number above 0 at most 1e+06, got 0.0."),

@@ -260,7 +260,7 @@ class VisualOdometry:
         return self.config.map.max_relative_variance
 
     def _T_world_cam(self, key: Keyframe) -> Float64[Tensor, "4 4"]:
-        return key.T_world_key @ lie.se3_inverse(self._T_cam_key)
+        return lie.se3_normalized(key.T_world_key @ lie.se3_inverse(self._T_cam_key))
 
     def _follow(self, key: Keyframe, frame: PyramidFrame) -> FrameEstimate:
         last = self._T_cam_key
@@ -272,7 +272,7 @@ class VisualOdometry:
         if found is None or found.inliers < self.config.lost_inliers:
             return self._lose(frame)
         was_lost, self._lost = self._lost > 0, 0
-        self._motion = found.T_cam_key @ lie.se3_inverse(last)
+        self._motion = lie.se3_normalized(found.T_cam_key @ lie.se3_inverse(last))
         self._T_cam_key, self._affine = found.T_cam_key, found.affine
         self._key_age += 1
         T_world_cam = self._T_world_cam(key)
@@ -357,7 +357,7 @@ class VisualOdometry:
 
     def _predicted(self, index: int, t_ns: int, reason: str) -> FrameEstimate:
         if self._key is not None:
-            self._T_cam_key = self._motion @ self._T_cam_key
+            self._T_cam_key = lie.se3_normalized(self._motion @ self._T_cam_key)
             return self._values(index, t_ns, self._T_world_cam(self._key), State.WEAK, reason, None)
         T = self._estimates[-1].T_world_cam if self._estimates else self._T_world_ref
         waiting = State.INITIALISING if self._keyframes == 0 else State.LOST

@@ -7,6 +7,7 @@ import torch
 from jaxtyping import Float64, Int64
 from torch import Tensor
 
+from torchvo360 import lie
 from torchvo360.agreement import agreement
 from torchvo360.alignment import AlignConfig, solve_level
 from torchvo360.checks import InputError
@@ -117,7 +118,7 @@ def track(
         if not bool(torch.isfinite(cost[best])):
             return None
         T, ab = solution.state[0][best : best + 1], solution.state[1][best : best + 1]
-    return measure(key, frame, T[0], ab[0], _thinned(usable, config.points_by_level[0]))
+    return measure(key, frame, lie.se3_normalized(T[0]), ab[0], _thinned(usable, config.points_by_level[0]))
 
 
 def measure(

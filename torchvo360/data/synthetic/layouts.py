@@ -222,7 +222,7 @@ def _read_panorama(path: Path) -> Tensor:
 
 
 def _room(generator: torch.Generator, movers: int, panorama: Tensor | None) -> World:
-    walkway = Walkway(centre=(0.2, -0.1), radii=(1.45, 1.0), eye_height=1.5)
+    walkway = Walkway(centre=(0.2, -0.1), radii=(1.4, 1.15), eye_height=1.5)
     materials = ("plaster", "brick", "planks", "stones", "collage", "mural")
     b = _Builder(generator, (7.5, 6.0, 2.8), walkway, materials, 100.0)
     b.place(3, ("planks", "mural"), radius=(0.18, 0.3), height=(1.6, 2.2), turned=False)
@@ -241,7 +241,7 @@ def _room(generator: torch.Generator, movers: int, panorama: Tensor | None) -> W
 
 
 def _pillars(generator: torch.Generator, movers: int, panorama: Tensor | None) -> World:
-    walkway = Walkway(centre=(0.0, 0.0), radii=(1.9, 1.35), eye_height=1.6)
+    walkway = Walkway(centre=(0.0, 0.0), radii=(1.9, 1.6), eye_height=1.6)
     materials = ("plaster", "stones", "paving", "brick", "collage", "mural")
     b = _Builder(generator, (14.0, 11.0, 4.0), walkway, materials, 80.0)
     b.place(18, ("brick", "stones", "collage", "mural"), radius=(0.16, 0.36), height=(4.0, 4.0), rounds=0.7, gap=0.7)
@@ -258,7 +258,7 @@ def _pillars(generator: torch.Generator, movers: int, panorama: Tensor | None) -
 
 
 def _courtyard(generator: torch.Generator, movers: int, panorama: Tensor | None) -> World:
-    walkway = Walkway(centre=(0.5, 0.0), radii=(1.9, 1.4), eye_height=1.6)
+    walkway = Walkway(centre=(0.5, 0.0), radii=(1.9, 1.6), eye_height=1.6)
     materials = ("brick", "stones", "paving", "planks", "clouds", "collage", "mural")
     b = _Builder(generator, (18.0, 14.0, 3.6), walkway, materials, 75.0)
     b.place(6, ("planks", "stones"), radius=(0.12, 0.25), height=(2.5, 4.5), rounds=1.0, gap=0.8)

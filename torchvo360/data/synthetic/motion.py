@@ -88,7 +88,7 @@ def trajectory(
         left = torch.stack([-heading.sin(), heading.cos(), still], -1)
         position = position + left * (0.02 * sway.wave(0, gait) + 0.04 * sway.wave(1, 2 * wander))[:, None]
         position[:, 2] += 0.022 * sway.wave(2, 2 * gait) + 0.06 * sway.wave(3, wander)
-        yaw = heading + 0.2 * sway.wave(4, 2 * wander) + 0.02 * sway.wave(5, gait)
+        yaw = heading + 0.12 * sway.wave(4, 2 * wander) + 0.02 * sway.wave(5, gait)
         pitch = 0.08 * sway.wave(6, wander) + 0.012 * sway.wave(7, 2 * gait)
         roll = 0.05 * sway.wave(8, wander) + 0.015 * sway.wave(9, gait)
     middle = frames // 2

@@ -19,6 +19,8 @@ from torchvo360.data.trajectory import Trajectory
 
 CAMERAS = ("equirectangular", "pinhole")
 EXPOSURES = ("constant", "steps", "drift")
+MAX_SEED = 2**32 - 1
+"""Largest seed: with the number of a frame it still makes a seed of 64 bits."""
 STEP_FRAMES = 20
 """Frames between two steps of the exposure."""
 
@@ -65,6 +67,8 @@ class SyntheticConfig:
             value = getattr(self, name)
             if not isinstance(value, int) or isinstance(value, bool) or value < least:
                 raise InputError(f"{name}: expected an integer of at least {least}, got {value!r}.")
+        if self.seed > MAX_SEED:
+            raise InputError(f"seed: expected at most {MAX_SEED}, got {self.seed}.")
         if self.camera == "equirectangular" and self.width != 2 * self.height:
             raise InputError(f"width: expected twice the height for a panorama, got {self.width} x {self.height}.")
         check_finite_number("fps", self.fps, above=0.0, at_most=1e6)

@@ -40,20 +40,25 @@ def _rodrigues_coefficients(
     return a, b, c
 
 
+def _exp_and_left_jacobian(
+    w: Float[Tensor, "*batch 3"],
+) -> tuple[Float[Tensor, "*batch 3 3"], Float[Tensor, "*batch 3 3"]]:
+    """Return I + a K + b K^2 and I + b K + c K^2 with K = hat(w), sharing the coefficients: the solvers' hot path."""
+    a, b, c = (part[..., None, None] for part in _rodrigues_coefficients((w * w).sum(-1)))
+    K = so3_hat(w)
+    K2 = K @ K
+    eye = torch.eye(3, dtype=w.dtype, device=w.device)
+    return eye + a * K + b * K2, eye + b * K + c * K2
+
+
 def so3_exp(w: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3 3"]:
     """Return the rotation by `|w|` radians about `w`."""
-    a, b, _ = _rodrigues_coefficients((w * w).sum(-1))
-    K = so3_hat(w)
-    eye = torch.eye(3, dtype=w.dtype, device=w.device)
-    return eye + a[..., None, None] * K + b[..., None, None] * (K @ K)
+    return _exp_and_left_jacobian(w)[0]
 
 
 def so3_left_jacobian(w: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3 3"]:
     """Return J_l with `exp(w + d) = exp(J_l d) exp(w)` to first order; it is also the V of the SE(3) exponential."""
-    _, b, c = _rodrigues_coefficients((w * w).sum(-1))
-    K = so3_hat(w)
-    eye = torch.eye(3, dtype=w.dtype, device=w.device)
-    return eye + b[..., None, None] * K + c[..., None, None] * (K @ K)
+    return _exp_and_left_jacobian(w)[1]
 
 
 def quaternion_from_matrix(R: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*batch 4"]:
@@ -129,8 +134,8 @@ def se3(R: Float[Tensor, "*batch 3 3"], t: Float[Tensor, "*batch 3"]) -> Float[T
 def se3_exp(xi: Float[Tensor, "*batch 6"]) -> Float[Tensor, "*batch 4 4"]:
     """Return the rigid motion of a tangent [v, w]."""
     check_shape("xi", xi, "... 6")
-    v, w = xi[..., :3], xi[..., 3:]
-    return se3(so3_exp(w), (so3_left_jacobian(w) @ v[..., None])[..., 0])
+    R, V = _exp_and_left_jacobian(xi[..., 3:])
+    return se3(R, (V @ xi[..., :3, None])[..., 0])
 
 
 def se3_log(T: Float[Tensor, "*batch 4 4"]) -> Float[Tensor, "*batch 6"]:

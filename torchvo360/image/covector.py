@@ -37,4 +37,5 @@ def gradient_magnitude(
     image: Float[Tensor, "*batch H W"], camera: Camera, rays: Float[Tensor, "H W 3"] | None = None
 ) -> Float[Tensor, "*batch H W"]:
     """Return |G| in intensity per pixel of the image's middle: equally strong edges are equal at every latitude."""
-    return torch.linalg.vector_norm(covector_field(image, camera, rays), dim=-3) * camera.pixel_angle
+    Gx, Gy, Gz = covector_field(image, camera, rays).unbind(-3)
+    return (Gx * Gx + Gy * Gy + Gz * Gz).sqrt() * camera.pixel_angle

@@ -94,14 +94,6 @@ class Solution(NamedTuple):
     """Steps tried, accepted or not."""
 
 
-def _take(equations: NormalEquations, index: Tensor) -> NormalEquations:
-    return NormalEquations(*(field[index] for field in equations))
-
-
-def _choose(mask: Tensor, new: Tensor, old: Tensor) -> Tensor:
-    return torch.where(mask.reshape(-1, *[1] * (old.ndim - 1)), new, old)
-
-
 def minimize(
     linearize: Callable[[State, Int64[Tensor, "A"]], NormalEquations],
     retract: Callable[[State, Float[Tensor, "A D"]], State],
@@ -126,34 +118,34 @@ def minimize(
     Returns:
         States, equations, status and steps of all elements; what ended badly keeps its best state.
     """
-    B = state[0].shape[0]
-    active = torch.arange(B, device=state[0].device)
+    device, B = state[0].device, state[0].shape[0]
+    active = torch.arange(B, device=device)
     equations = linearize(state, active)
-    status = torch.full((B,), int(Status.MAX_STEPS), device=active.device)
-    steps = torch.zeros_like(status)
     enough = equations.weight >= min_weight
     finite = torch.isfinite(equations.cost) & torch.isfinite(equations.g).all(-1)
-    status = torch.where(finite, status, int(Status.DIVERGED))
+    status = torch.where(enough & finite, int(Status.MAX_STEPS), int(Status.DIVERGED))
     status = torch.where(enough, status, int(Status.TOO_FEW_PIXELS))
-    active = (enough & finite).nonzero()[:, 0]
-    damping = initial_damping(config, equations.g[active])
+    result = Solution(state, equations, status, torch.zeros(B, dtype=torch.int64, device=device))
+    ready = enough & finite
+    if not bool(ready.all()):
+        active, state, equations = active[ready], _pick(state, ready), NormalEquations(*_pick(equations, ready))
+    damping = initial_damping(config, equations.g)
+    steps = torch.zeros_like(active)
     fixed = torch.diag((~free).to(equations.H.dtype))
     both_free = free[:, None] & free
 
     for _ in range(config.max_steps):
         if active.numel() == 0:
-            break
-        current = _take(equations, active)
-        weight = current.weight[:, None]
-        H = current.H / weight[..., None] * both_free + fixed
-        g = current.g / weight * free
-        cost = current.cost / current.weight
-        damped = H + torch.diag_embed(damping.value[:, None] * H.diagonal(dim1=-2, dim2=-1))
-        delta, solvable = solve_ldl(damped, -g)
-        candidate = retract(tuple(part[active] for part in state), delta)
+            return result
+        weight = equations.weight[:, None]
+        H = equations.H / weight[..., None] * both_free + fixed
+        g = equations.g / weight * free
+        cost = equations.cost / equations.weight
+        delta, solvable = solve_ldl(H + torch.diag_embed(damping.value[:, None] * H.diagonal(dim1=-2, dim2=-1)), -g)
+        candidate = retract(state, delta)
         proposed = linearize(candidate, active)
         proposed_cost = proposed.cost / proposed.weight.clamp_min(min_weight)
-        promised = -(g * delta).sum(-1) - 0.5 * (delta * (H @ delta[..., None])[..., 0]).sum(-1)
+        promised = -(delta * (g + 0.5 * (H @ delta[..., None])[..., 0])).sum(-1)
         gained = cost - proposed_cost
         usable = solvable & torch.isfinite(proposed_cost) & (proposed.weight >= min_weight)
         accepted = usable & (gained > 0)
@@ -164,23 +156,51 @@ def minimize(
         singular = ~solvable & (damping.value >= 1)
         stalled = ~accepted & (damping.value >= config.max_damping) & ~converged & ~singular
 
-        steps[active] += 1
-        ended = status[active]
-        for outcome, mask in ((Status.CONVERGED, converged), (Status.SINGULAR, singular), (Status.STALLED, stalled)):
-            ended = torch.where(mask, int(outcome), ended)
-        status = status.index_copy(0, active, ended)
-        state = tuple(
-            part.index_copy(0, active, _choose(accepted, new, part[active]))
-            for part, new in zip(state, candidate, strict=True)
-        )
-        equations = NormalEquations(
-            *(
-                old.index_copy(0, active, _choose(accepted, new, old[active]))
-                for old, new in zip(equations, proposed, strict=True)
-            )
-        )
+        steps = steps + 1
         gain = gained / promised.clamp_min(torch.finfo(promised.dtype).tiny)
-        going = ~(converged | singular | stalled)
-        damping = Damping(*(part[going] for part in next_damping(config, damping, accepted, gain)))
-        active = active[going]
-    return Solution(state, equations, status, steps)
+        damping = next_damping(config, damping, accepted, gain)
+        if bool(accepted.all()):
+            state, equations = candidate, proposed
+        else:
+            state = tuple(_choose(accepted, new, old) for new, old in zip(candidate, state, strict=True))
+            chosen = (_choose(accepted, new, old) for new, old in zip(proposed, equations, strict=True))
+            equations = NormalEquations(*chosen)
+        ended = converged | singular | stalled
+        if bool(ended.any()):
+            outcome = torch.where(converged, int(Status.CONVERGED), int(Status.STALLED))
+            outcome = torch.where(singular, int(Status.SINGULAR), outcome)
+            result = _write(result, active, ended, state, equations, outcome, steps)
+            going = ~ended
+            active, state, steps = active[going], _pick(state, going), steps[going]
+            equations, damping = NormalEquations(*_pick(equations, going)), Damping(*_pick(damping, going))
+    everything = torch.ones_like(active, dtype=torch.bool)
+    return _write(result, active, everything, state, equations, result.status[active], steps)
+
+
+def _pick(parts: tuple[Tensor, ...], index: Tensor) -> tuple[Tensor, ...]:
+    return tuple(part[index] for part in parts)
+
+
+def _choose(mask: Tensor, new: Tensor, old: Tensor) -> Tensor:
+    return torch.where(mask.reshape(-1, *[1] * (old.ndim - 1)), new, old)
+
+
+def _write(
+    result: Solution,
+    active: Int64[Tensor, "A"],
+    which: Bool[Tensor, "A"],
+    state: State,
+    equations: NormalEquations,
+    status: Int64[Tensor, "A"],
+    steps: Int64[Tensor, "A"],
+) -> Solution:
+    """Put what some active elements ended with into their places in the result."""
+    place = active[which]
+    return Solution(
+        tuple(old.index_copy(0, place, new[which]) for old, new in zip(result.state, state, strict=True)),
+        NormalEquations(
+            *(old.index_copy(0, place, new[which]) for old, new in zip(result.equations, equations, strict=True))
+        ),
+        result.status.index_copy(0, place, status[which]),
+        result.steps.index_copy(0, place, steps[which]),
+    )

@@ -8,11 +8,15 @@ from jaxtyping import Bool, Float, Float64, Int64, UInt8
 from torch import Tensor
 
 from torchvo360 import lie
+from torchvo360.cameras import Camera
 from torchvo360.checks import InputError, check_finite_number
 from torchvo360.depth import FilterConfig, InverseRange
 from torchvo360.depth.filter import box_sums, scatter
-from torchvo360.image import interpolate, locate, select_pixels
+from torchvo360.image import equal_area_cells, interpolate, locate, select_pixels
 from torchvo360.vo.frame import FrameBuilder, PyramidFrame
+
+GUESS_RADII_PX = (6, 14)
+"""Half widths of the surroundings from which new points take their first guess."""
 
 
 @dataclass(kw_only=True)
@@ -64,70 +68,116 @@ class Keyframe:
 
 
 def make_keyframe(
-    frame: PyramidFrame, T_world_key: Float64[Tensor, "4 4"], builder: FrameBuilder, config: MapConfig
+    frame: PyramidFrame,
+    T_world_key: Float64[Tensor, "4 4"],
+    builder: FrameBuilder,
+    config: MapConfig,
+    carried: "CarriedPoints | None" = None,
 ) -> Keyframe:
-    """Choose a frame's points; their inverse ranges are unknown: rho 1, variance 1, score 0."""
+    """Choose a frame's points: those carried over from the last keyframe, and new ones where they leave a cell empty.
+
+    New points' inverse ranges are guesses, with score 0: rho 1 and variance 1 without carried points.
+    """
+    camera = builder.cameras[0]
     strength = builder.strength(frame)
+    usable = builder.usable(frame)
+    cell = equal_area_cells(camera, config.points, device=strength.device).flatten()
+    taken = torch.zeros(int(cell.max()) + 1, dtype=torch.bool, device=strength.device)
+    if carried is not None:
+        carried = carried.one_per_cell(cell[carried.pixel], usable.flatten() & (strength.flatten() > 0))
+        taken[cell[carried.pixel]] = True
     pixel = select_pixels(
-        strength, builder.usable(frame), builder.cameras[0], config.points, minimum=config.min_gradient
+        strength, usable & ~taken[cell].view_as(usable), camera, config.points, minimum=config.min_gradient
     )
     ray = builder.rays(pixel)
+    points = InverseRange(torch.ones_like(ray[0]), torch.ones_like(ray[0]), torch.zeros_like(ray[0]))
+    if carried is not None:
+        points = carried.guess(pixel, camera)
+        pixel, order = torch.cat([carried.pixel, pixel]).sort(stable=True)
+        ray = torch.cat([carried.ray, ray], 1)[:, order]
+        points = InverseRange(*(torch.cat(pair)[order] for pair in zip(carried.points, points, strict=True)))
     values = []
     for target in frame.targets:
         u, v = target.camera.pixel_of(*ray[:, None].unbind(0))
         values.append(interpolate(target.padded, locate(u, v, target.camera)).value[0, 0])
-    unknown = InverseRange(torch.ones_like(ray[0]), torch.ones_like(ray[0]), torch.zeros_like(ray[0]))
-    return Keyframe(frame, T_world_key, pixel, ray, strength.flatten()[pixel], values, unknown)
+    return Keyframe(frame, T_world_key, pixel, ray, strength.flatten()[pixel], values, points)
 
 
-def moved_points(
-    key: Keyframe, T_cam_key: Float64[Tensor, "4 4"]
-) -> tuple[Float[Tensor, "3 N"], Float[Tensor, "N"], Float[Tensor, "N"]]:
-    """Return a keyframe's points in another camera on the sphere: unit rays, inverse distances and their derivative.
-
-    The derivative is d rho' / d rho = (rho' / rho)^2 along the ray, which carries a variance over.
-    """
+def moved_points(key: Keyframe, T_cam_key: Float64[Tensor, "4 4"]) -> tuple[Float[Tensor, "3 N"], Float[Tensor, "N"]]:
+    """Return a keyframe's points in another camera: unit rays and inverse distances."""
     T = T_cam_key.to(key.ray.dtype)
     rho = key.points.rho
     Y = T[:3, :3] @ key.ray + rho * T[:3, 3:]
     length = torch.linalg.vector_norm(Y, dim=0).clamp_min(1e-12)
-    return Y / length, rho / length, length.square().reciprocal()
+    return Y / length, rho / length
 
 
-def hand_over(
-    old: Keyframe, new: Keyframe, T_new_old: Float64[Tensor, "4 4"], builder: FrameBuilder, config: FilterConfig
-) -> InverseRange:
-    """Return the inverse ranges of a new keyframe's points from the old one's, pooled by 1 / V over neighbours.
+@dataclass(frozen=True)
+class CarriedPoints:
+    """Points of an old keyframe where they lie in a new one.
 
-    Points without near neighbours take the mean of a wider surrounding as a guess, with a variance that says so.
+    The same points are carried on, at their exact places, instead of pooling them on new pixels: averages over
+    neighbours at different ranges are biased, and the bias of every keyframe adds up to a drift of scale.
     """
-    camera = builder.cameras[0]
-    rays, rho, _ = moved_points(old, T_new_old)
-    # To first order V' = V (rho' / rho)^4; the floor of 2 % of rho stands for what the pose may have wrong.
-    ratio = rho / old.points.rho.clamp_min(1e-6)
-    variance = old.points.variance * ratio**4 + (0.02 * rho) ** 2
-    uv, seen = camera.project(rays.T)
-    good = (old.points.score > 0) & seen
-    rho, variance, uv = rho[good], variance[good], uv[good]
-    if rho.numel() == 0:
-        return new.points
+
+    pixel: Int64[Tensor, "N"]
+    ray: Float[Tensor, "3 N"]
+    points: InverseRange
+
+    def take(self, index: Tensor) -> "CarriedPoints":
+        """Return some of the points."""
+        return CarriedPoints(
+            self.pixel[index], self.ray[:, index], InverseRange(*(part[index] for part in self.points))
+        )
+
+    def one_per_cell(self, cell: Int64[Tensor, "N"], usable: Bool[Tensor, "P"]) -> "CarriedPoints":
+        """Return each cell's surest point on a usable pixel."""
+        rho, variance, _ = self.points
+        good = usable[self.pixel].nonzero()[:, 0]
+        sure = good[(variance / rho.square().clamp_min(1e-12))[good].argsort(stable=True)]
+        order = sure[cell[sure].argsort(stable=True)]
+        first = torch.ones_like(order, dtype=torch.bool)
+        first[1:] = cell[order][1:] != cell[order][:-1]
+        return self.take(order[first])
+
+    def guess(self, pixel: Int64[Tensor, "M"], camera: Camera) -> InverseRange:
+        """Guess new points' inverse ranges from the carried ones around, pooled by 1 / V, with score 0."""
+        rho, variance, _ = self.points
+        median = rho.median()
+        # Relative to the median, so that the thresholds below know no unit; capped, so that no single point rules.
+        weight = 1 / (variance / median**2 + 1e-3)
+        sums = scatter(camera, self.pixel, torch.stack([weight, weight * rho]))
+        near, wide = (box_sums(sums, camera, radius).flatten(1)[:, pixel] for radius in GUESS_RADII_PX)
+        around, guess = near[1] / near[0].clamp_min(1e-9), wide[1] / wide[0].clamp_min(1e-9)
+        has_near, has_wide = near[0] > 5, wide[0] > 5
+        out = torch.where(has_near, around, torch.where(has_wide, guess, median))
+        relative = torch.where(has_near, 0.09, 0.36).to(out.dtype)
+        return InverseRange(out, relative * out * out, torch.zeros_like(out))
+
+
+def carry(
+    old: Keyframe,
+    frame: PyramidFrame,
+    T_new_old: Float64[Tensor, "4 4"],
+    affine: Float64[Tensor, "2"],
+    camera: Camera,
+    config: FilterConfig,
+    cutoff: float,
+) -> CarriedPoints:
+    """Return an old keyframe's good points in a new frame; hidden ones, whose intensity differs, are left behind."""
+    ray, rho = moved_points(old, T_new_old)
+    # To first order V' = V (rho' / rho)^4.
+    variance = old.points.variance * (rho / old.points.rho.clamp_min(1e-6)) ** 4
+    variance = torch.maximum(variance, config.variance_floor * rho * rho)
+    uv, seen = camera.project(ray.T)
+    target = frame.targets[0]
+    value = interpolate(target.padded, locate(uv[None, :, 0], uv[None, :, 1], camera)).value[0, 0]
+    residual = value - float(affine[0].exp()) * old.values[0] - float(affine[1])
+    good = ((old.points.score > 0) & seen & (residual.abs() < cutoff)).nonzero()[:, 0]
     column = uv[:, 0].long().clamp(0, camera.width - 1)
     row = uv[:, 1].long().clamp(0, camera.height - 1)
-    median = rho.median()
-    # Relative to the median, so that the thresholds below know no unit; capped, so that no single point rules.
-    weight = 1 / (variance / median**2 + 1e-3)
-    sums = scatter(camera, row * camera.width + column, torch.stack([weight, weight * rho]))
-    near, far, wide = (
-        box_sums(sums, camera, radius).flatten(1)[:, new.pixel]
-        for radius in (config.radius_px, 3 * config.radius_px, 14)
-    )
-    pooled, around, guess = (part[1] / part[0].clamp_min(1e-9) for part in (near, far, wide))
-    has_near, has_far, has_wide = near[0] > 5, far[0] > 5, wide[0] > 5
-    out = torch.where(has_near, pooled, torch.where(has_far, around, torch.where(has_wide, guess, median)))
-    relative = torch.where(
-        has_near, (4 / near[0].clamp_min(1e-9)).clamp_min(config.variance_floor), torch.where(has_far, 0.09, 0.36)
-    )
-    return InverseRange(out, relative * out * out, 2.0 * has_near.to(out.dtype))
+    everything = CarriedPoints(row * camera.width + column, ray, InverseRange(rho, variance, old.points.score))
+    return everything.take(good)
 
 
 @dataclass(frozen=True)
@@ -152,7 +202,7 @@ def median_parallax(key: Keyframe, T_cam_key: Float64[Tensor, "4 4"], usable: Bo
     """Return the median angle by which the translation moves the usable points, radians; 0 without points."""
     if not bool(usable.any()):
         return 0.0
-    moved, _, _ = moved_points(key, T_cam_key)
+    moved, _ = moved_points(key, T_cam_key)
     turned = T_cam_key[:3, :3].to(key.ray.dtype) @ key.ray
     cross = torch.linalg.vector_norm(torch.linalg.cross(turned, moved, dim=0), dim=0)
     return float(torch.atan2(cross, (turned * moved).sum(0))[usable].median())

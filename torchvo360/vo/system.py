@@ -25,7 +25,7 @@ from torchvo360.vo.map import (
     Keyframe,
     MapConfig,
     PointCloud,
-    hand_over,
+    carry,
     make_keyframe,
     median_parallax,
     to_cloud,
@@ -309,8 +309,8 @@ class VisualOdometry:
             return
         camera = self._builder.cameras[0]
         key.points = smooth(key.points, key.pixel, camera, key.points.score > 0, self.config.filter)
-        new = make_keyframe(frame, self._T_world_cam(key), self._builder, settings)
-        new.points = hand_over(key, new, found.T_cam_key, self._builder, self.config.filter)
+        carried = carry(key, frame, found.T_cam_key, found.affine, camera, self.config.filter, self.config.track.cutoff)
+        new = make_keyframe(frame, self._T_world_cam(key), self._builder, settings, carried)
         self._clouds.append(to_cloud(key, self._limit))
         self._unit = float(key.points.rho[key.points.score > 0].median())
         self._recent.append(key)

@@ -1,0 +1,224 @@
+"""What a run leaves: a folder with trajectory, frames, map, picture, figures and settings, and a few closing lines."""
+
+import csv
+import importlib.metadata
+import importlib.util
+import json
+import math
+import platform
+import tempfile
+from collections import Counter
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from dataclasses import asdict, dataclass
+from datetime import datetime
+from decimal import Decimal
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import torch
+
+from torchvo360.cameras import Camera
+from torchvo360.checks import InputError
+from torchvo360.data import Trajectory
+from torchvo360.evaluation import Evaluation
+from torchvo360.export import atomic_path, write_ply, write_tum
+from torchvo360.settings import RunConfig
+from torchvo360.viz import plot_trajectory
+from torchvo360.vo import FrameEstimate, OdometryResult
+
+FILES = ("trajectory.txt", "frames.csv", "map.ply", "trajectory.png", "config.yaml", "summary.json")
+"""In the order in which they are written: where there is a summary, the run is complete."""
+
+COLUMNS = ("index", "time", "state", "reason", "residual", "inliers", "a", "b", "milliseconds")
+
+ERRORS = ("ate_rmse_m", "ate_percent", "rpe_translation_percent", "rpe_rotation_deg", "rotation_median_deg", "scale")
+"""Figures against the truth, as `Evaluation` names them."""
+
+
+@dataclass(frozen=True)
+class Record:
+    """All that is known of a run when its last frame is done."""
+
+    config: RunConfig
+    config_yaml: str
+    name: str
+    camera: Camera
+    result: OdometryResult
+    problems: Counter[str]
+    """Of the frames that could not be used."""
+    seconds: float
+    """From the first frame to the last, reading included."""
+    truth: Trajectory | None
+    evaluation: Evaluation | None
+    notes: list[str]
+
+
+def can_plot() -> bool:
+    """Return whether matplotlib is installed."""
+    return importlib.util.find_spec("matplotlib") is not None
+
+
+def new_folder(parent: Path) -> Path:
+    """Make a folder named by date and time, with a number behind it where another run has the same second."""
+    name = datetime.now().strftime("%Y-%m-%d_%H-%M-%S")
+    parent.mkdir(parents=True, exist_ok=True)
+    for number in range(1, 10_000):
+        folder = parent / (name if number == 1 else f"{name}_{number}")
+        with suppress(FileExistsError):
+            folder.mkdir()
+            return folder
+    raise InputError(f"out: expected fewer than 10000 runs in a second, got more in {parent}.")
+
+
+@contextmanager
+def output_folder(out: str | None, name: str, *, overwrite: bool) -> Iterator[Path]:
+    """Make the folder of a run and take it away again if nothing has been put into it.
+
+    Args:
+        out: Where the user wants it; None for runs/<name>/<date_time>.
+        name: Of the input.
+        overwrite: Whether `out` may hold another run.
+
+    Raises:
+        InputError: It cannot be written, or holds another run.
+    """
+    wanted = Path("runs", name) if out is None else Path(out).expanduser()
+    made = [path for path in (wanted, *wanted.parents) if not path.exists()]
+    try:
+        try:
+            if out is None:
+                folder = new_folder(wanted)
+                made.insert(0, folder)
+            else:
+                folder = wanted
+                folder.mkdir(parents=True, exist_ok=True)
+            tempfile.TemporaryFile(dir=folder).close()
+        except OSError as error:
+            raise InputError(f"out: expected a folder that can be written, got {wanted}: {error.strerror}.") from None
+        if not overwrite and any((folder / file).exists() for file in FILES):
+            raise InputError(f"out: expected a folder without a run, or overwrite=true, got {folder}, which holds one.")
+        yield folder
+    finally:
+        for path in made:
+            with suppress(OSError):  # not empty: another run's, or results
+                path.rmdir()
+
+
+def write_all(folder: Path, record: Record) -> dict[str, Any]:
+    """Write all files of a run and return its summary.
+
+    Raises:
+        InputError: One cannot be written.
+    """
+    result, config = record.result, record.config
+    draw = config.plot != "false" and can_plot()
+    summary = summarise(record)
+    try:
+        write_tum(folder / "trajectory.txt", result.trajectory)
+        _write_frames(folder / "frames.csv", result.frames)
+        write_ply(folder / "map.ply", result.points.xyz, result.points.rgb)
+        if draw:
+            with atomic_path(folder / "trajectory.png") as temporary:
+                states = [str(frame.state) for frame in result.frames]
+                truth = record.truth if record.evaluation else None
+                plot_trajectory(temporary, result.trajectory, truth=truth, states=states, title=record.name)
+        else:
+            (folder / "trajectory.png").unlink(missing_ok=True)  # an overwritten run's
+        _write_text(folder / "config.yaml", record.config_yaml)
+        _write_text(folder / "summary.json", json.dumps(summary, indent=2, allow_nan=False) + "\n")
+    except OSError as error:
+        raise InputError(f"out: expected a folder that can be written, got {folder}: {error.strerror}.") from None
+    return summary
+
+
+def summarise(record: Record) -> dict[str, Any]:
+    """Return the figures of a run, and what it takes to repeat it, as values of JSON; None for one that is not finite."""
+    frames, evaluation = record.result.frames, record.evaluation
+    computing_s = sum(frame.milliseconds for frame in frames) / 1e3
+    notes = list(record.notes)
+    if not record.result.keyframes:
+        reason, _ = Counter(frame.reason for frame in frames).most_common(1)[0]
+        notes.append(f"no map could be started (mostly {reason}): the poses are rotations, without positions.")
+    if record.config.plot == "auto" and not can_plot():
+        notes.append("trajectory.png is left out: it needs matplotlib, which pip install 'torchvo360[viz]' brings.")
+    figures: dict[str, Any] = {
+        "name": record.name,
+        "input": record.config.input,
+        "width": record.camera.width,
+        "height": record.camera.height,
+        "frames": len(frames),
+        "unusable_frames": dict(record.problems),
+        "states": dict(Counter(str(frame.state) for frame in frames)),
+        "coverage": len(record.result.trajectory) / len(frames) if evaluation is None else evaluation.coverage,
+        "keyframes": record.result.keyframes,
+        "points": len(record.result.points.xyz),
+        "seconds": record.seconds,
+        "fps": len(frames) / record.seconds,
+        "odometry_fps": len(frames) / computing_s,
+    }
+    if evaluation is not None:
+        figures |= {name: getattr(evaluation, name) for name in (*ERRORS, "path_length_m", "pairs")}
+    figures |= {"notes": notes, "threads": torch.get_num_threads(), "versions": _versions()}
+    return _finite(figures | {"settings": asdict(record.config)})
+
+
+def describe(summary: dict[str, Any], folder: Path) -> list[str]:
+    """Return what the user reads at the end, from the summary."""
+    states = ", ".join(f"{count} {state}" for state, count in summary["states"].items())
+    unusable = ", ".join(f"{count} {problem}" for problem, count in summary["unusable_frames"].items())
+    size = f"{summary['width']} x {summary['height']}"
+    lines = [
+        f"{summary['name']}: {summary['frames']} frames of {size} in {summary['seconds']:.1f} s",
+        f"states: {states}" + (f"; unusable frames: {unusable}" if unusable else ""),
+        f"map: {summary['keyframes']} keyframes, {summary['points']} points",
+    ]
+    figures = [*(name for name in ERRORS if name in summary), "coverage", "fps"]
+    width = max(map(len, figures))
+    lines += [f"{name:<{width}}  {_figure(summary[name])}" for name in figures]
+    return [*lines, *(f"note: {note}" for note in summary["notes"]), f"results: {folder}"]
+
+
+def _figure(value: float | None) -> str:
+    return "undefined" if value is None else f"{value:.4g}"
+
+
+def _versions() -> dict[str, str]:
+    try:
+        own = importlib.metadata.version("torchvo360")
+    except importlib.metadata.PackageNotFoundError:  # run from a checkout that is not installed
+        own = "not installed"
+    return {
+        "torchvo360": own,
+        "python": platform.python_version(),
+        "torch": str(torch.__version__),
+        "opencv": cv2.__version__,
+        "numpy": np.__version__,
+    }
+
+
+def _finite(value: Any) -> Any:
+    """Return the value with None for every number that JSON cannot hold."""
+    if isinstance(value, dict):
+        return {key: _finite(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [_finite(item) for item in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def _write_text(path: Path, text: str) -> None:
+    with atomic_path(path) as temporary:
+        temporary.write_text(text, encoding="utf-8")
+
+
+def _write_frames(path: Path, frames: list[FrameEstimate]) -> None:
+    """Write a line a frame: seconds as in trajectory.txt, and nothing where there is no number."""
+    with atomic_path(path) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.writer(file, lineterminator="\n")
+        writer.writerow(COLUMNS)
+        for frame in frames:
+            numbers = (frame.residual, frame.inliers, frame.a, frame.b, frame.milliseconds)
+            words = (f"{number:.6g}" if math.isfinite(number) else "" for number in numbers)
+            writer.writerow([frame.index, f"{Decimal(frame.t_ns).scaleb(-9):.9f}", frame.state, frame.reason, *words])

@@ -1,0 +1,222 @@
+"""One run: open the input, step through its frames, compare with the truth, write everything down."""
+
+import itertools
+import signal
+import sys
+import threading
+import time
+from collections import Counter
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from types import FrameType, TracebackType
+
+import cv2
+import torch
+from jaxtyping import Bool
+from torch import Tensor
+from tqdm import tqdm
+
+from torchvo360.checks import InputError
+from torchvo360.data import Frame, ImageSequence, Trajectory
+from torchvo360.data.images import open_images
+from torchvo360.data.masks import parse_mask
+from torchvo360.data.synthetic import SyntheticSequence
+from torchvo360.data.tum import read_tum
+from torchvo360.evaluation import evaluate
+from torchvo360.outputs import Record, can_plot, describe, output_folder, write_all
+from torchvo360.settings import SYNTHETIC, RunConfig, embedded_clip
+from torchvo360.vo import VisualOdometry
+
+AUTO_SIZE = (1024, 512)
+"""Width and height of wider input under `resize=auto`: more pixels cost time and gain little."""
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """How a run ended."""
+
+    lines: list[str]
+    """What the user reads."""
+    complaint: str = ""
+    """One sentence on what went wrong, if something did."""
+    exit_code: int = 0
+
+
+class StopSignals:
+    """While it is entered, the first Ctrl-C or SIGTERM is only noted, so that a run can end in good order.
+
+    A second one acts as it did before. Outside the main thread, where Python delivers no signals, it does nothing.
+    """
+
+    def __init__(self) -> None:
+        self.received: signal.Signals | None = None
+        self._before: dict[signal.Signals, signal.Handlers] = {}
+
+    def __enter__(self) -> "StopSignals":
+        if threading.current_thread() is threading.main_thread():
+            for number in (signal.SIGINT, signal.SIGTERM):
+                self._before[number] = signal.signal(number, self._note)  # pyright: ignore[reportArgumentType]
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._restore()
+
+    def _note(self, number: int, frame: FrameType | None) -> None:
+        self.received = signal.Signals(number)
+        self._restore()
+
+    def _restore(self) -> None:
+        while self._before:
+            signal.signal(*self._before.popitem())
+
+
+def run(config: RunConfig, *, config_yaml: str = "") -> Outcome:
+    """Estimate the motion in one input and write the results into its output folder.
+
+    A run that is stopped by Ctrl-C or SIGTERM ends after the frame at hand and keeps what was done.
+
+    Args:
+        config: Settings.
+        config_yaml: The settings as they are to be written into config.yaml.
+
+    Raises:
+        InputError: The caller's mistake; then there is no output folder either.
+    """
+    if config.device == "cuda" and not torch.cuda.is_available():
+        raise InputError("device: expected cpu, as PyTorch finds no CUDA device here, got cuda.")
+    if config.plot == "true" and not can_plot():
+        raise InputError("plot: expected matplotlib, which pip install 'torchvo360[viz]' brings, or plot=false.")
+    sequence, notes = open_input(config)
+    truth = sequence.truth if config.truth is None else _read_truth(config.truth)
+    mask = None if config.mask is None else parse_mask(config.mask, sequence.camera)
+    with (
+        output_folder(config.out, sequence.name, overwrite=config.overwrite) as folder,
+        _threads(config.threads),
+        torch.inference_mode(),
+        StopSignals() as stop,
+    ):
+        return _run(config, config_yaml, sequence, truth, mask, notes, folder, stop)
+
+
+def _run(
+    config: RunConfig,
+    config_yaml: str,
+    sequence: ImageSequence,
+    truth: Trajectory | None,
+    mask: Bool[Tensor, "H W"] | None,
+    notes: list[str],
+    folder: Path,
+    stop: StopSignals,
+) -> Outcome:
+    began = time.perf_counter()
+    odometry = VisualOdometry(sequence.camera, config.vo, mask=mask, seed=config.seed, device=config.device)
+    problems: Counter[str] = Counter()
+    frames = iter(sequence)
+    opening = list(itertools.islice(frames, 2))
+    if truth is not None:
+        _check_overlap(truth, opening, sequence.length)
+    disable = None if config.progress else True  # None: where standard error is no terminal
+    with tqdm(total=sequence.length, desc=sequence.name, unit="frame", disable=disable, leave=False) as bar:
+        for count, frame in enumerate(itertools.chain(opening, frames), 1):
+            estimate = odometry.step(frame)
+            problems.update([frame.problem] if frame.problem else [])
+            bar.set_postfix_str(estimate.state, refresh=False)
+            bar.update()
+            if stop.received:
+                break
+    seconds = time.perf_counter() - began
+    exit_code = 128 + stop.received if stop.received else 0
+    good = count - problems.total()
+    if good < 2:
+        if stop.received:
+            return Outcome([], "Stopped before two frames were done: nothing is written.", exit_code)
+        seen = ", ".join(f"{number} {problem}" for problem, number in problems.items())
+        raise InputError(f"input: expected at least two usable frames, got {good} of {count} ({seen}).")
+
+    notes = notes + list(getattr(sequence, "notes", []))
+    if stop.received:
+        of = f" of {sequence.length}" if sequence.length else ""
+        notes.append(f"stopped by {stop.received.name} after {count}{of} frames; the results hold what was done.")
+    result = odometry.finish()
+    evaluation, complaint = None, ""
+    if truth is not None:
+        try:
+            evaluation = evaluate(result.trajectory, truth)
+        except InputError as error:
+            complaint = f"truth: no figures, {error}"
+            exit_code = exit_code or 2
+    record = Record(
+        config, config_yaml, sequence.name, sequence.camera, result, problems, seconds, truth, evaluation, notes
+    )
+    return Outcome(describe(write_all(folder, record), folder), complaint, exit_code)
+
+
+def open_input(config: RunConfig) -> tuple[ImageSequence, list[str]]:
+    """Open what `input` names, and return notes for the user on what was decided.
+
+    Raises:
+        InputError: It is missing, unreadable or not 2:1, or a setting does not go with it.
+    """
+    if config.input == SYNTHETIC:
+        usual = RunConfig()
+        for name in ("resize", "start", "stop", "every", "fps", "truth"):
+            value = getattr(config, name)
+            if value != getattr(usual, name):
+                raise InputError(f"{name}: expected no value for a synthetic input (see synthetic.*), got {value}.")
+        return SyntheticSequence(config.synthetic), []
+    opened = partial(
+        open_images,
+        str(embedded_clip(config.input) or config.input),
+        camera_fit=config.camera.fit,
+        start=config.start,
+        stop=config.stop,
+        every=config.every,
+        fps=config.fps,
+    )
+    sequence = opened(resize=config.size)
+    if config.resize != "auto" or sequence.camera.width <= AUTO_SIZE[0]:
+        return sequence, []
+    size, auto = (" x ".join(map(str, pair)) for pair in (sequence.fit.target, AUTO_SIZE))
+    note = f"frames of {size} were brought down to {auto}; resize=WxH chooses a size, resize=null keeps theirs."
+    return opened(resize=AUTO_SIZE), [note]
+
+
+def _read_truth(path: str) -> Trajectory:
+    try:
+        return read_tum(path)
+    except InputError as error:
+        raise InputError(f"truth: {error}") from None
+
+
+def _check_overlap(truth: Trajectory, opening: list[Frame], length: int | None) -> None:
+    """Refuse, before the work is done, a truth of another time: a clock's, say, for a video that starts at 0."""
+    if len(opening) < 2:
+        return
+    begin_ns, period_ns = opening[0].t_ns, opening[1].t_ns - opening[0].t_ns
+    end_ns = begin_ns + period_ns * (length or 0)
+    if truth.t_ns[-1] < begin_ns - period_ns or (length and truth.t_ns[0] > end_ns + period_ns):
+        first, last = (float(t_ns) / 1e9 for t_ns in truth.t_ns[[0, -1]])
+        until = f" to {end_ns / 1e9:g}" if length else " on"
+        raise InputError(
+            f"truth: expected poses at the frames' times, {begin_ns / 1e9:g}{until} s, got {first:.10g} to {last:.10g} s."
+        )
+
+
+@contextmanager
+def _threads(count: int | None) -> Iterator[None]:
+    """Compute with this many threads, and with as many as before afterwards."""
+    before = torch.get_num_threads(), cv2.getNumThreads()
+    try:
+        if count is not None:
+            torch.set_num_threads(count)
+            cv2.setNumThreads(count)
+        yield
+    finally:
+        if count is not None:
+            torch.set_num_threads(before[0])
+            cv2.setNumThreads(before[1])

@@ -2,7 +2,6 @@
 
 import itertools
 import signal
-import sys
 import threading
 import time
 from collections import Counter

@@ -8,8 +8,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from torchvo360.residuals.direct import Reference, Target, by_rho, look_up, system_rows, weight_slope_rows
 from torchvo360.residuals.normal import NormalEquations
-from torchvo360.residuals.direct import Reference, Target, by_rho, look_up, system_rows
 from torchvo360.residuals.weights import LossConfig, depth_variance_weight, robust
 
 CHUNK_SAMPLES = 49152
@@ -46,13 +46,18 @@ def linearize(
         points = reference.chunk(start, min(start + size, N))
         samples = look_up(points, target, T, ab)
         weight, residual = samples.weight, samples.residual
+        slope_rows = None
         if points.variance is not None:
-            by_depth = depth_variance_weight(by_rho(samples, T[:, :3, 3]), points.variance[:, None], noise)
+            t = T[:, :3, 3]
+            by_depth, slope = depth_variance_weight(by_rho(samples, t), points.variance[:, None], noise)
             robust_weight, robust_cost = robust(residual * by_depth.sqrt(), loss)
             robust_weight = robust_weight * by_depth
+            slope_rows = weight_slope_rows(samples, slope * residual * (weight * robust_weight).sqrt(), t)
         else:
             robust_weight, robust_cost = robust(residual, loss)
         S = system_rows(samples, (weight * robust_weight).sqrt())
+        if slope_rows is not None:
+            S[:, :6] += slope_rows
         M = M + torch.bmm(S, S.mT)
         cost = cost + (weight * robust_cost).sum((1, 2))
         total = total + weight.sum((1, 2)) * C

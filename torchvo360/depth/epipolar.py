@@ -14,10 +14,8 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from torchvo360.cameras import Camera
 from torchvo360.checks import InputError, check_finite_number
-from torchvo360.image import interpolate, locate
-from torchvo360.residuals.direct import Target
+from torchvo360.residuals.direct import Target, look_up_value
 
 HALF_PATTERN = 2
 """Samples on each side of the centre: 5 in all (S2, section 4.1)."""
@@ -100,18 +98,6 @@ def _great_circles(ray: Float[Tensor, "3 N"], T_tgt_ref: Float[Tensor, "4 4"]) -
     return _Circles(start, across / sine.clamp_min(1e-6), torch.atan2(sine, cosine), sine, baseline)
 
 
-def _intensity(target: Target, direction: Float[Tensor, "3 M S"]) -> Float[Tensor, "M S"]:
-    """Look up intensities in directions of the target camera; NaN where the camera does not see them."""
-    x, y, z = (component.reshape(1, -1) for component in direction)
-    camera = target.camera
-    u, v = camera.pixel_of(x, y, z)
-    value = interpolate(target.padded, locate(u, v, camera)).value[0, 0]
-    seen = camera.sees(torch.stack([x, y, z], -1), torch.stack([u, v], -1), margin=0.5)
-    if seen is not None:
-        value = value.masked_fill(~seen[0], torch.nan)
-    return value.view(direction.shape[1:])
-
-
 def search_great_circles(
     reference: Target,
     target: Target,
@@ -182,7 +168,7 @@ def _reference_samples(
     unit = ray / torch.linalg.vector_norm(ray, dim=0)
     towards = T[:3, :3].mT @ circles.towards
     angle = torch.arange(-HALF_PATTERN, HALF_PATTERN + 1, dtype=ray.dtype, device=ray.device) * step
-    return _intensity(reference, unit[..., None] * angle.cos() + towards[..., None] * angle.sin())
+    return look_up_value(reference, unit[..., None] * angle.cos() + towards[..., None] * angle.sin())
 
 
 def _search(
@@ -201,7 +187,7 @@ def _search(
     )
     theta = middle[:, None] + offsets * step
     direction = circles.start[..., None] * theta.cos() + circles.towards[..., None] * theta.sin()
-    window = _intensity(target, direction).unfold(1, 2 * HALF_PATTERN + 1, 1)
+    window = look_up_value(target, direction).unfold(1, 2 * HALF_PATTERN + 1, 1)
     ssd = (window - samples[:, None]).square().sum(-1).nan_to_num(nan=torch.inf)
     centre = theta[:, HALF_PATTERN:-HALF_PATTERN]
     inside = (

@@ -80,6 +80,23 @@ def make_target(
     return Target(camera, padded, confidence, saturation)
 
 
+def look_up_value(target: Target, ray: Float[Tensor, "3 *points"]) -> Float[Tensor, "*points"]:
+    """Return an image's values along rays of its camera; NaN where the camera does not see them.
+
+    Args:
+        target: One image (batch 1) of one channel.
+        ray: Rays in the image's camera.
+    """
+    x, y, z = (component.reshape(1, -1) for component in ray)
+    camera = target.camera
+    u, v = camera.pixel_of(x, y, z)
+    value = interpolate(target.padded, locate(u, v, camera)).value[0, 0]
+    seen = camera.sees(torch.stack([x, y, z], -1), torch.stack([u, v], -1), margin=0.5)
+    if seen is not None:
+        value = value.masked_fill(~seen[0], torch.nan)
+    return value.view(ray.shape[1:])
+
+
 class Samples(NamedTuple):
     """Warped points and what they meet in the target; each tensor is [B, C, N] or broadcasts to it."""
 
@@ -163,4 +180,17 @@ def system_rows(samples: Samples, root_weight: Float[Tensor, "B C N"]) -> Float[
         -root_weight,
         samples.residual * root_weight,
     ]
+    return torch.stack(rows, 1).flatten(2)
+
+
+def weight_slope_rows(
+    samples: Samples, factor: Float[Tensor, "B C N"], t_tgt_ref: Float[Tensor, "B 3"]
+) -> Float[Tensor, "B 6 M"]:
+    """Return `-factor * d(dI/drho) / d(v, w)` with G and s held: what a weight that depends on dI/drho adds to the rows.
+
+    dI/drho = G . t / s, and a step moves t by v + w x t.
+    """
+    tx, ty, tz = t_tgt_ref[..., None, None].unbind(1)
+    Gx, Gy, Gz = (component * (samples.inv_scale * -factor) for component in samples.G)
+    rows = [Gx, Gy, Gz, ty * Gz - tz * Gy, tz * Gx - tx * Gz, tx * Gy - ty * Gx]
     return torch.stack(rows, 1).flatten(2)

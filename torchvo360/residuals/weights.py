@@ -70,8 +70,12 @@ def robust(
 
 def depth_variance_weight(
     dI_drho: Float[Tensor, "*batch"], variance: Float[Tensor, "*batch"], noise: float
-) -> Float[Tensor, "*batch"]:
-    """Return `2 s^2 / (2 s^2 + (dI/drho)^2 V)`: LSD-SLAM's weight (equations.md, section 5) relative to exact depth.
+) -> tuple[Float[Tensor, "*batch"], Float[Tensor, "*batch"]]:
+    """Return W = `2 s^2 / (2 s^2 + (dI/drho)^2 V)` and its logarithmic slope `-d ln(sqrt W) / d(dI/drho)`.
+
+    W is LSD-SLAM's weight (equations.md, section 5) relative to exact depth. The slope is needed because dI/drho grows
+    with the translation: with W held constant in a Gauss-Newton step, noise in rho shrinks every translation a little,
+    and the scale drifts. With it the normalised residual is minimised as it is, which is total least squares.
 
     Args:
         dI_drho: Derivative of the residual by the inverse range.
@@ -79,4 +83,6 @@ def depth_variance_weight(
         noise: Standard deviation s of an intensity.
     """
     floor = 2 * noise**2
-    return floor / torch.addcmul(torch.full_like(variance, floor), dI_drho * dI_drho, variance)
+    spread = dI_drho * variance
+    total = torch.addcmul(torch.full_like(spread, floor), dI_drho, spread)
+    return floor / total, spread / total

@@ -20,11 +20,11 @@ from torchvo360.depth import EpipolarConfig, FilterConfig, InverseRange, fuse, s
 from torchvo360.motion.essential import TwoView, estimate_two_view
 from torchvo360.motion.flow import bearings, find_corners, follow
 from torchvo360.motion.rotation import fit_rotation
-from torchvo360.residuals.direct import Reference, Target
+from torchvo360.residuals.direct import Reference, Target, look_up_value
 from torchvo360.residuals.weights import LossConfig
 from torchvo360.vo.frame import FrameBuilder, PyramidFrame
 from torchvo360.vo.map import Keyframe, MapConfig, make_keyframe
-from torchvo360.vo.refine import refine_jointly
+from torchvo360.vo.refine import pattern_rays, refine_jointly
 from torchvo360.vo.track import TrackConfig
 
 
@@ -158,10 +158,11 @@ class Initialiser:
         if chosen.numel() < self.track.min_points:
             self.reason = "refinement_failed"
             return None
+        rays = pattern_rays(key.ray[:, chosen], self.builder.cameras[0].pixel_angle)
         joint = refine_jointly(
-            key.ray[:, chosen],
+            rays,
             key.points.rho[chosen],
-            key.values[0][chosen],
+            look_up_value(reference.targets[0], rays),
             _together([frame.targets[0] for frame in frames]),
             T,
             ab,

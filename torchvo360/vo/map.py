@@ -12,7 +12,8 @@ from torchvo360.cameras import Camera
 from torchvo360.checks import InputError, check_finite_number
 from torchvo360.depth import FilterConfig, InverseRange
 from torchvo360.depth.filter import box_sums, scatter
-from torchvo360.image import equal_area_cells, interpolate, locate, select_pixels
+from torchvo360.image import equal_area_cells, select_pixels
+from torchvo360.residuals.direct import look_up_value
 from torchvo360.vo.frame import FrameBuilder, PyramidFrame
 
 GUESS_RADII_PX = (6, 14)
@@ -96,10 +97,7 @@ def make_keyframe(
         pixel, order = torch.cat([carried.pixel, pixel]).sort(stable=True)
         ray = torch.cat([carried.ray, ray], 1)[:, order]
         points = InverseRange(*(torch.cat(pair)[order] for pair in zip(carried.points, points, strict=True)))
-    values = []
-    for target in frame.targets:
-        u, v = target.camera.pixel_of(*ray[:, None].unbind(0))
-        values.append(interpolate(target.padded, locate(u, v, target.camera)).value[0, 0])
+    values = [look_up_value(target, ray) for target in frame.targets]
     return Keyframe(frame, T_world_key, pixel, ray, strength.flatten()[pixel], values, points)
 
 
@@ -170,9 +168,7 @@ def carry(
     variance = old.points.variance * (rho / old.points.rho.clamp_min(1e-6)) ** 4
     variance = torch.maximum(variance, config.variance_floor * rho * rho)
     uv, seen = camera.project(ray.T)
-    target = frame.targets[0]
-    value = interpolate(target.padded, locate(uv[None, :, 0], uv[None, :, 1], camera)).value[0, 0]
-    residual = value - float(affine[0].exp()) * old.values[0] - float(affine[1])
+    residual = look_up_value(frame.targets[0], ray) - float(affine[0].exp()) * old.values[0] - float(affine[1])
     good = ((old.points.score > 0) & seen & (residual.abs() < cutoff)).nonzero()[:, 0]
     column = uv[:, 0].long().clamp(0, camera.width - 1)
     row = uv[:, 1].long().clamp(0, camera.height - 1)

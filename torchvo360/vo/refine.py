@@ -1,8 +1,9 @@
 """Joint photometric refinement of a start: poses, brightness and inverse ranges together, by a Schur complement.
 
-One host frame, K target frames, N points. Each residual depends on one frame's (pose, a, b) and one point's rho; the
-inverse ranges are eliminated, because their block is diagonal (equations.md, section 6). The unit is held by the length
-of the last frame's translation: with the scale free, two-frame refinement accepts no step (measured).
+One host frame, K target frames, N points, each seen through a pattern of 8 pixels. Each residual depends on one frame's
+(pose, a, b) and one point's rho; the inverse ranges are eliminated, because their block is diagonal (equations.md,
+section 6). The unit is held by the length of the last frame's translation: with the scale free, two-frame refinement
+accepts no step (measured).
 """
 
 from typing import NamedTuple
@@ -31,6 +32,29 @@ class JointState(NamedTuple):
     cost: float
 
 
+PATTERN = ((0, -2), (-1, -1), (1, -1), (-2, 0), (0, 0), (2, 0), (-1, 1), (0, 2))
+"""DSO's pattern, pixels to the right and down. Single pixels leave too little once each has its own inverse range."""
+
+
+def pattern_rays(ray: Float[Tensor, "3 N"], pixel_angle: float) -> Float[Tensor, "3 N P"]:
+    """Return the pattern's unit rays around each ray, laid in its tangent plane, so that it has one size everywhere.
+
+    Args:
+        ray: Unit rays.
+        pixel_angle: The angle of one pixel, radians.
+    """
+    x, _, z = ray
+    # Rightwards along the parallel; on the vertical axis any direction serves.
+    flat = torch.stack([z, torch.zeros_like(z), -x])
+    flat = torch.where((x.abs() + z.abs() > 1e-6), flat, flat.new_tensor([[1.0], [0.0], [0.0]]))
+    right = flat / torch.linalg.vector_norm(flat, dim=0)
+    # x right, y down, z forward is right-handed: forward x right = down.
+    down = torch.linalg.cross(ray, right, dim=0)
+    offset = ray.new_tensor(PATTERN) * pixel_angle
+    rays = ray[..., None] + right[..., None] * offset[:, 0] + down[..., None] * offset[:, 1]
+    return rays / torch.linalg.vector_norm(rays, dim=0)
+
+
 class _System(NamedTuple):
     H: Float64[Tensor, "K 8 8"]
     g: Float64[Tensor, "K 8"]
@@ -43,8 +67,9 @@ class _System(NamedTuple):
 def _linearize(
     ray: Tensor, rho: Tensor, value: Tensor, targets: Target, T: Tensor, affine: Tensor, loss: LossConfig
 ) -> _System:
-    K, N = T.shape[0], rho.shape[0]
-    reference = Reference(ray[None], rho.expand(K, N), value.expand(K, 1, N), torch.ones_like(rho).expand(K, N))
+    K, (N, P) = T.shape[0], value.shape
+    each = rho.repeat_interleave(P).expand(K, -1)
+    reference = Reference(ray.reshape(1, 3, -1), each, value.reshape(1, 1, -1).expand(K, -1, -1), torch.ones_like(each))
     samples = look_up(reference, targets, T.to(ray.dtype), affine.to(ray.dtype))
     weight, cost = robust(samples.residual, loss)
     weight = weight * samples.weight
@@ -54,17 +79,17 @@ def _linearize(
     return _System(
         H=jacobian @ jacobian.mT,
         g=(jacobian @ residual[..., None])[..., 0],
-        by_point=jacobian * along[:, None],
-        H_rho=along.square().sum(0),
-        g_rho=(along * residual).sum(0),
+        by_point=(jacobian * along[:, None]).view(K, 8, N, P).sum(-1),
+        H_rho=along.square().sum(0).view(N, P).sum(-1),
+        g_rho=(along * residual).sum(0).view(N, P).sum(-1),
         cost=float((cost * samples.weight).sum()),
     )
 
 
 def refine_jointly(
-    ray: Float[Tensor, "3 N"],
+    ray: Float[Tensor, "3 N P"],
     rho: Float[Tensor, "N"],
-    value: Float[Tensor, "N"],
+    value: Float[Tensor, "N P"],
     targets: Target,
     T_tgt_ref: Float64[Tensor, "K 4 4"],
     affine: Float64[Tensor, "K 2"],
@@ -75,9 +100,9 @@ def refine_jointly(
     """Refine a start by Levenberg-Marquardt until the cost falls by less than 0.1 % or the steps are spent.
 
     Args:
-        ray: The host's unit rays.
-        rho: Their inverse ranges to start from.
-        value: Their intensities.
+        ray: The host's unit rays, P for each point.
+        rho: The points' inverse ranges to start from.
+        value: The rays' intensities.
         targets: The K target images.
         T_tgt_ref: Poses to start from; the last one's translation keeps its length.
         affine: (a, b) of each target to start from.

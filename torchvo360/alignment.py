@@ -1,8 +1,8 @@
 """Coarse-to-fine direct alignment of image pairs, batched: the layer that models and the odometry share.
 
 A reference image with inverse range is warped into a target image; pose and affine brightness are found by
-Levenberg-Marquardt from the coarsest pyramid level to the finest. A pair is called CONVERGED only if its solve converged
-on the finest level and its parts agree on the answer (`agreement`): a wrong minimum is a failure, and says so.
+Levenberg-Marquardt from the coarsest pyramid level to the finest. A pair is called CONVERGED only if its solve
+converged on the finest level and the images agree there (`agreement`): a wrong minimum is a failure, and says so.
 """
 
 import math
@@ -13,7 +13,7 @@ from jaxtyping import Bool, Float, Int64
 from torch import Tensor
 
 from torchvo360 import lie
-from torchvo360.agreement import agreement
+from torchvo360.agreement import agreeing_share
 from torchvo360.backends import linearize
 from torchvo360.cameras import Camera
 from torchvo360.checks import (
@@ -40,7 +40,7 @@ class AlignConfig:
     coarsest_width: int = 64
     """Rotation-only alignment at 64 x 32 pixels converges from 40 deg, at 128 x 64 from 15 (measured)."""
     finest: int = 0
-    """Level at which to stop: 0 is the image's own resolution, and stopping at half of it is three times less accurate."""
+    """Level at which to stop: 0 is the image's own resolution; stopping at half of it is three times less accurate."""
     blur_px: float = 0.5
     """Smoothing of both images before all else; with the exact derivative it gains about a quarter in accuracy."""
     affine: bool = True
@@ -169,8 +169,8 @@ def _levels(
 def match_brightness(reference: Reference, target: Target) -> Float[Tensor, "B 2"]:
     """Return (a, b) that give the reference's values the target's mean and spread, over all that is usable.
 
-    It needs no pose: where the same scene fills both images it is close, and exposure jumps of several stops are bridged
-    before the first step. The gain is held within a factor of five.
+    It needs no pose: where the same scene fills both images it is close, and exposure jumps of several stops are
+    bridged before the first step. The gain is held within a factor of five.
     """
     padded = target.padded[..., 1:-1, 1:-1].double()
     ones = torch.ones_like(padded[:, :1])
@@ -262,7 +262,7 @@ def align(
         camera: The camera of both.
         T_tgt_ref: Where to start; the identity by default.
         mask: Pixels of the reference to use; all by default. Pixels of either image that are not finite are never used.
-        weight: Further weight of each reference pixel, at least 0; 1 by default. The solid angle is applied in any case.
+        weight: Further weight of each reference pixel, at least 0; 1 by default. Solid angle always applies.
         config: Settings.
 
     Returns:
@@ -317,7 +317,7 @@ def _coarse_to_fine(
     solution = _solve_numbered(levels, config.finest, T, affine, config)
     T, affine = solution.state
     equations = solution.equations
-    agreed = agreement(levels[config.finest].reference, levels[config.finest].target, T, affine).double()
+    agreed = agreeing_share(levels[config.finest].reference, levels[config.finest].target, T, affine).double()
     false_minimum = (solution.status == Status.CONVERGED) & (agreed < config.min_agreement)
     status = torch.where(false_minimum, int(Status.DIVERGED), solution.status)
     fields = {

@@ -135,7 +135,7 @@ def write_all(folder: Path, record: Record) -> dict[str, Any]:
 
 
 def summarise(record: Record) -> dict[str, Any]:
-    """Return the figures of a run, and what it takes to repeat it, as values of JSON; None for one that is not finite."""
+    """Return the figures of a run and what it takes to repeat it, for JSON: None for a number that is not finite."""
     frames, evaluation = record.result.frames, record.evaluation
     computing_s = sum(frame.milliseconds for frame in frames) / 1e3
     notes = list(record.notes)
@@ -169,15 +169,16 @@ def describe(summary: dict[str, Any], folder: Path) -> list[str]:
     """Return what the user reads at the end, from the summary."""
     states = ", ".join(f"{count} {state}" for state, count in summary["states"].items())
     unusable = ", ".join(f"{count} {problem}" for problem, count in summary["unusable_frames"].items())
-    size = f"{summary['width']} x {summary['height']}"
+    size, speed = f"{summary['width']} x {summary['height']}", f"{summary['fps']:.1f} a second"
     lines = [
-        f"{summary['name']}: {summary['frames']} frames of {size} in {summary['seconds']:.1f} s",
+        f"{summary['name']}: {summary['frames']} frames of {size} in {summary['seconds']:.1f} s, {speed}",
         f"states: {states}" + (f"; unusable frames: {unusable}" if unusable else ""),
-        f"map: {summary['keyframes']} keyframes, {summary['points']} points",
+        f"map: {summary['points']} points from {summary['keyframes']} keyframes",
     ]
-    figures = [*(name for name in ERRORS if name in summary), "coverage", "fps"]
-    width = max(map(len, figures))
-    lines += [f"{name:<{width}}  {_figure(summary[name])}" for name in figures]
+    if figures := [*(name for name in ERRORS if name in summary)]:
+        figures += ["coverage", "fps"]
+        width = max(map(len, figures))
+        lines += [f"{name:<{width}}  {_figure(summary[name])}" for name in figures]
     return [*lines, *(f"note: {note}" for note in summary["notes"]), f"results: {folder}"]
 
 

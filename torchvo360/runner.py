@@ -9,13 +9,10 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
-from pathlib import Path
 from types import FrameType, TracebackType
 
 import cv2
 import torch
-from jaxtyping import Bool
-from torch import Tensor
 from tqdm import tqdm
 
 from torchvo360.checks import InputError
@@ -99,60 +96,78 @@ def run(config: RunConfig, *, config_yaml: str = "") -> Outcome:
         torch.inference_mode(),
         StopSignals() as stop,
     ):
-        return _run(config, config_yaml, sequence, truth, mask, notes, folder, stop)
+        odometry = VisualOdometry(sequence.camera, config.vo, mask=mask, seed=config.seed, device=config.device)
+        journey = _step_through(sequence, odometry, truth, stop, config.progress)
+        if journey.usable < 2 and stop.received:
+            return Outcome([], "stopped before two frames were done: nothing is written.", 128 + stop.received)
+        if journey.usable < 2:
+            problems = ", ".join(f"{count} {problem}" for problem, count in journey.problems.items())
+            got = f"{journey.usable} of {journey.frames}" + f" ({problems})" * bool(problems)
+            raise InputError(f"input: expected at least two usable frames, got {got}.")
+        notes += getattr(sequence, "notes", [])
+        if stop.received:
+            of = f" of {sequence.length}" if sequence.length else ""
+            notes.append(f"stopped by {stop.received.name} after {journey.frames}{of} frames; they are kept.")
+        result = odometry.finish()
+        evaluation, complaint = None, ""
+        if truth is not None:
+            try:
+                evaluation = evaluate(result.trajectory, truth)
+            except InputError as error:
+                complaint = f"truth: {error} The results are kept, without figures."
+        record = Record(
+            config=config,
+            config_yaml=config_yaml,
+            name=sequence.name,
+            camera=sequence.camera,
+            result=result,
+            problems=journey.problems,
+            seconds=journey.seconds,
+            truth=truth,
+            evaluation=evaluation,
+            notes=notes,
+        )
+        lines = describe(write_all(folder, record), folder)
+        return Outcome(lines, complaint, 128 + stop.received if stop.received else 2 if complaint else 0)
 
 
-def _run(
-    config: RunConfig,
-    config_yaml: str,
-    sequence: ImageSequence,
-    truth: Trajectory | None,
-    mask: Bool[Tensor, "H W"] | None,
-    notes: list[str],
-    folder: Path,
-    stop: StopSignals,
-) -> Outcome:
+@dataclass(frozen=True)
+class Journey:
+    """What the loop saw."""
+
+    frames: int
+    problems: Counter[str]
+    """Of the frames that could not be used."""
+    seconds: float
+
+    @property
+    def usable(self) -> int:
+        """The number of frames without a problem."""
+        return self.frames - self.problems.total()
+
+
+def _step_through(
+    sequence: ImageSequence, odometry: VisualOdometry, truth: Trajectory | None, stop: StopSignals, progress: bool
+) -> Journey:
+    """Give every frame to the odometry, until they end or the user does not want any more."""
     began = time.perf_counter()
-    odometry = VisualOdometry(sequence.camera, config.vo, mask=mask, seed=config.seed, device=config.device)
     problems: Counter[str] = Counter()
+    count = 0
     frames = iter(sequence)
     opening = list(itertools.islice(frames, 2))
     if truth is not None:
         _check_overlap(truth, opening, sequence.length)
-    disable = None if config.progress else True  # None: where standard error is no terminal
+    disable = None if progress else True  # None: where standard error is no terminal
     with tqdm(total=sequence.length, desc=sequence.name, unit="frame", disable=disable, leave=False) as bar:
-        for count, frame in enumerate(itertools.chain(opening, frames), 1):
+        for frame in itertools.chain(opening, frames):
             estimate = odometry.step(frame)
+            count += 1
             problems.update([frame.problem] if frame.problem else [])
             bar.set_postfix_str(estimate.state, refresh=False)
             bar.update()
             if stop.received:
                 break
-    seconds = time.perf_counter() - began
-    exit_code = 128 + stop.received if stop.received else 0
-    good = count - problems.total()
-    if good < 2:
-        if stop.received:
-            return Outcome([], "Stopped before two frames were done: nothing is written.", exit_code)
-        seen = ", ".join(f"{number} {problem}" for problem, number in problems.items())
-        raise InputError(f"input: expected at least two usable frames, got {good} of {count} ({seen}).")
-
-    notes = notes + list(getattr(sequence, "notes", []))
-    if stop.received:
-        of = f" of {sequence.length}" if sequence.length else ""
-        notes.append(f"stopped by {stop.received.name} after {count}{of} frames; the results hold what was done.")
-    result = odometry.finish()
-    evaluation, complaint = None, ""
-    if truth is not None:
-        try:
-            evaluation = evaluate(result.trajectory, truth)
-        except InputError as error:
-            complaint = f"truth: no figures, {error}"
-            exit_code = exit_code or 2
-    record = Record(
-        config, config_yaml, sequence.name, sequence.camera, result, problems, seconds, truth, evaluation, notes
-    )
-    return Outcome(describe(write_all(folder, record), folder), complaint, exit_code)
+    return Journey(count, problems, time.perf_counter() - began)
 
 
 def open_input(config: RunConfig) -> tuple[ImageSequence, list[str]]:
@@ -167,7 +182,10 @@ def open_input(config: RunConfig) -> tuple[ImageSequence, list[str]]:
             value = getattr(config, name)
             if value != getattr(usual, name):
                 raise InputError(f"{name}: expected no value for a synthetic input (see synthetic.*), got {value}.")
-        return SyntheticSequence(config.synthetic), []
+        try:
+            return SyntheticSequence(config.synthetic), []
+        except InputError as error:
+            raise InputError(f"synthetic.{error}") from None
     opened = partial(
         open_images,
         str(embedded_clip(config.input) or config.input),
@@ -200,10 +218,8 @@ def _check_overlap(truth: Trajectory, opening: list[Frame], length: int | None) 
     end_ns = begin_ns + period_ns * (length or 0)
     if truth.t_ns[-1] < begin_ns - period_ns or (length and truth.t_ns[0] > end_ns + period_ns):
         first, last = (float(t_ns) / 1e9 for t_ns in truth.t_ns[[0, -1]])
-        until = f" to {end_ns / 1e9:g}" if length else " on"
-        raise InputError(
-            f"truth: expected poses at the frames' times, {begin_ns / 1e9:g}{until} s, got {first:.10g} to {last:.10g} s."
-        )
+        expected = f"{begin_ns / 1e9:g}" + (f" to {end_ns / 1e9:g} s" if length else " s and later")
+        raise InputError(f"truth: expected poses at the frames' times, {expected}, got {first:.10g} to {last:.10g} s.")
 
 
 @contextmanager

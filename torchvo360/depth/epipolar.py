@@ -1,10 +1,10 @@
 """Search for every point's match along its epipolar great circle, all points at once.
 
-The match of a reference ray r1 in the target lies on the great circle from R r1 (a point at infinity) to t (a point at the
-camera), at the angle theta with tan(theta) = rho |t| sin(phi) / (1 + rho |t| cos(phi)), where phi is the angle between the
-two ends (equations.md, section 5). The search runs in steps of one pixel of arc around the predicted angle, compares
-five samples spaced along the curve, refines the best by a parabola, and says how sure the result is (LSD-SLAM, Engel et
-al. 2013: geometric and photometric error of a disparity).
+The match of a reference ray r1 in the target lies on the great circle from R r1 (a point at infinity) to t (a point at
+the camera), at the angle theta with tan(theta) = rho |t| sin(phi) / (1 + rho |t| cos(phi)), where phi is the angle
+between the two ends (equations.md, section 5). The search runs in steps of one pixel of arc around the predicted angle,
+compares five samples spaced along the curve, refines the best by a parabola, and says how sure the result is (LSD-SLAM,
+Engel et al. 2013: geometric and photometric error of a disparity).
 """
 
 from dataclasses import dataclass
@@ -26,7 +26,7 @@ class EpipolarConfig:
     """Settings of the search along great circles."""
 
     max_half_width_px: int = 20
-    """Points whose two-sigma interval is wider than this on either side of the prediction wait for a better baseline."""
+    """Points whose two-sigma interval is wider than this on either side of the prediction wait for less."""
     min_gradient: float = 5 / 255
     """Root mean square change of intensity per pixel along the curve below which a match says nothing."""
     min_sine: float = 0.1

@@ -2,8 +2,8 @@
 
     r = I_tgt(project(R r_ref + rho t)) - (e^a I_ref + b)
 
-in the tangent form of equations.md, section 3: with the point's ray r2 and inverse range rho2 in the target and the image
-gradient as a covector G on that ray, the row of the Jacobian by (v, w, a, b) is [rho2 G, r2 x G, -e^a I_ref, -1].
+in the tangent form of equations.md, section 3: with the point's ray r2 and inverse range rho2 in the target and the
+image gradient as a covector G on that ray, the Jacobian's row by (v, w, a, b) is [rho2 G, r2 x G, -e^a I_ref, -1].
 """
 
 from dataclasses import dataclass
@@ -186,7 +186,7 @@ def system_rows(samples: Samples, root_weight: Float[Tensor, "B C N"]) -> Float[
 def weight_slope_rows(
     samples: Samples, factor: Float[Tensor, "B C N"], t_tgt_ref: Float[Tensor, "B 3"]
 ) -> Float[Tensor, "B 6 M"]:
-    """Return `-factor * d(dI/drho) / d(v, w)` with G and s held: what a weight that depends on dI/drho adds to the rows.
+    """Return `-factor * d(dI/drho) / d(v, w)` with G and s held: what a weight by dI/drho adds to the rows.
 
     dI/drho = G . t / s, and a step moves t by v + w x t.
     """

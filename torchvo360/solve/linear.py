@@ -13,8 +13,8 @@ def solve_ldl(
 ) -> tuple[Float[Tensor, "*batch D"], Bool[Tensor, "*batch"]]:
     """Solve `A x = b` for symmetric positive definite A by LDL^T (equations.md, section 7).
 
-    The matrix is first scaled to a unit diagonal, so that parameters of different units weigh alike. The signs and sizes
-    of D tell whether it is positive definite.
+    The matrix is first scaled to a unit diagonal, so that parameters of different units weigh alike. The signs and
+    sizes of D tell whether it is positive definite.
 
     Returns:
         x: The solution; zero where A is not positive definite or not finite.

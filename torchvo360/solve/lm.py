@@ -1,8 +1,8 @@
 """Batched Levenberg-Marquardt: `(H + lambda diag H) delta = -g`, every element of the batch its own problem.
 
 Each element has its own damping, its own acceptance and its own end; elements that have ended leave the work. One
-linearisation a step: the candidate's serves as the next step's when it is accepted. Costs are compared as means over the
-samples' weights, because samples may leave the view between steps.
+linearisation a step: the candidate's serves as the next step's when it is accepted. Costs are compared as means over
+the samples' weights, because samples may leave the view between steps.
 """
 
 from collections.abc import Callable
@@ -28,7 +28,7 @@ class LMConfig:
 
     max_steps: int = 30
     damping: str = "gain_ratio"
-    """gain_ratio: Nielsen's rule, by how well the model predicted the cost; lsd: LSD-SLAM's schedule (equations.md, 7)."""
+    """gain_ratio: Nielsen's rule, by how well the model predicted the cost; lsd: LSD-SLAM's (equations.md, 7)."""
     initial_damping: float = 1e-3
     """Lambda at the start, relative to the diagonal of H; the lsd schedule starts from 0."""
     max_damping: float = 1e5
@@ -36,7 +36,7 @@ class LMConfig:
     step_tolerance: float = 0.01
     """A shorter accepted step has converged; in the unit of `step_scale`, for alignment in pixels."""
     cost_tolerance: float = 1e-5
-    """An accepted step that lowers the cost by a smaller share has converged, as has a refused step that promised less."""
+    """A step that lowers the cost by a smaller share has converged, as has a refused one that promised less."""
 
     def __post_init__(self) -> None:
         if self.max_steps < 1:

@@ -1,8 +1,8 @@
 """The start: from an unknown scene to a first keyframe with inverse ranges.
 
-Corners are followed from frame to frame across the seam. Once they show enough parallax, a robust essential matrix gives
-motion and ranges, the epipolar search makes them dense on the keyframe's points, and a joint photometric refinement
-settles all. Until then every frame gets a rotation, and the initialiser says what it waits for.
+Corners are followed from frame to frame across the seam. Once they show enough parallax, a robust essential matrix
+gives motion and ranges, the epipolar search makes them dense on the keyframe's points, and a joint photometric
+refinement settles all. Until then every frame gets a rotation, and the initialiser says what it waits for.
 """
 
 import math

@@ -34,7 +34,7 @@ class MapConfig:
     """Frames after which a keyframe is made in any case, once there is some parallax."""
     min_visible: float = 0.55
     """Share of agreeing gradient below which a new keyframe is made, if there is some parallax."""
-    max_relative_variance: float = 0.1
+    max_relative_variance: float = 0.05
     """Points with V / rho^2 below this track and enter the point cloud."""
 
     def __post_init__(self) -> None:

@@ -1,7 +1,7 @@
 """The odometry: frames in, a pose and a state for every one of them out.
 
-A step reads: build the pyramid, predict, track; if that is weak, search the rotation and look at earlier keyframes; fuse
-the frame into the keyframe's inverse ranges; make a new keyframe where the parallax asks for one.
+A step reads: build the pyramid, predict, track; if that is weak, search the rotation and look at earlier keyframes;
+fuse the frame into the keyframe's inverse ranges; make a new keyframe where the parallax asks for one.
 """
 
 import math

@@ -4,7 +4,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from torchvo360.residuals.direct import Reference, Target, look_up
+from torchvo360.cameras import Camera
+from torchvo360.residuals.direct import Reference, Samples, Target, look_up
 
 TOLERANCE_PX = 0.5
 """A residual agrees if a displacement of this many pixels along the gradient would explain it."""
@@ -28,10 +29,14 @@ def agreeing_share(
         Between 0 and 1; 0 where the images have no gradient or no point is seen.
     """
     dtype = reference.value.dtype
-    samples = look_up(reference, target, T_tgt_ref.to(dtype), affine.to(dtype))
+    return share_of_samples(look_up(reference, target, T_tgt_ref.to(dtype), affine.to(dtype)), target.camera)
+
+
+def share_of_samples(samples: Samples, camera: Camera) -> Float[Tensor, "B"]:
+    """Return `agreeing_share` of samples that have been looked up already."""
     Gx, Gy, Gz = samples.G
-    slope2 = (Gx * Gx + Gy * Gy + Gz * Gz) * target.camera.pixel_angle**2
+    slope2 = (Gx * Gx + Gy * Gy + Gz * Gz) * camera.pixel_angle**2
     energy = samples.weight * slope2
     explained = energy * (samples.residual**2 < TOLERANCE_PX**2 * slope2)
     total = energy.sum((1, 2))
-    return explained.sum((1, 2)) / total.clamp_min(torch.finfo(dtype).tiny)
+    return explained.sum((1, 2)) / total.clamp_min(torch.finfo(energy.dtype).tiny)

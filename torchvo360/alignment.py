@@ -331,7 +331,7 @@ def _coarse_to_fine(
         "variance": equations.square / (equations.weight - 8).clamp_min(1),
         "agreement": agreed,
     }
-    return AlignResult(**{name: value.reshape(*batch, *value.shape[1:]) for name, value in fields.items()})
+    return AlignResult(**{name: value.reshape((*batch, *value.shape[1:])) for name, value in fields.items()})
 
 
 def _solve_numbered(levels: list[_Level], number: int, T: Tensor, affine: Tensor, config: AlignConfig) -> Solution:

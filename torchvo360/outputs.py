@@ -140,8 +140,7 @@ def summarise(record: Record) -> dict[str, Any]:
     computing_s = sum(frame.milliseconds for frame in frames) / 1e3
     notes = list(record.notes)
     if not record.result.keyframes:
-        reason, _ = Counter(frame.reason for frame in frames).most_common(1)[0]
-        notes.append(f"no map could be started (mostly {reason}): the poses are rotations, without positions.")
+        notes.append(f"no map could be started ({frames[-1].reason}): the poses are rotations, without positions.")
     if record.config.plot == "auto" and not can_plot():
         notes.append("trajectory.png is left out: it needs matplotlib, which pip install 'torchvo360[viz]' brings.")
     figures: dict[str, Any] = {

@@ -114,7 +114,7 @@ def run(config: RunConfig, *, config_yaml: str = "") -> Outcome:
             try:
                 evaluation = evaluate(result.trajectory, truth)
             except InputError as error:
-                complaint = f"truth: {error} The results are kept, without figures."
+                complaint = f"{error} The results are kept, without figures."
         record = Record(
             config=config,
             config_yaml=config_yaml,

@@ -53,7 +53,8 @@ def compose(overrides: Sequence[str], conf: Path) -> RunConfig:
     try:
         OmegaConf.resolve(config)
     except OmegaConfBaseException as error:
-        raise InputError(f"{error.full_key}: expected a value, got one that refers to nothing: {error.msg}.") from None
+        complaint = str(error).partition("\n")[0]
+        raise InputError(f"settings: expected ${{...}} to name a known key, got: {complaint}.") from None
     return _to_dataclass(config)
 
 

@@ -91,10 +91,11 @@ def _great_circles(ray: Float[Tensor, "3 N"], T_tgt_ref: Float[Tensor, "4 4"]) -
     R, t = T_tgt_ref[:3, :3], T_tgt_ref[:3, 3]
     baseline = torch.linalg.vector_norm(t).clamp_min(1e-12)
     epipole = (t / baseline)[:, None]
-    start = R @ (ray / torch.linalg.vector_norm(ray, dim=0))
+    start = R @ ray
     cosine = (epipole * start).sum(0).clamp(-1, 1)
     across = epipole - cosine * start
-    sine = torch.linalg.vector_norm(across, dim=0)
+    # Not vector_norm: over the leading axis it is ten times slower.
+    sine = across.square().sum(0).sqrt()
     return _Circles(start, across / sine.clamp_min(1e-6), torch.atan2(sine, cosine), sine, baseline)
 
 
@@ -114,8 +115,8 @@ def search_great_circles(
     Args:
         reference: The reference image, batch 1 and one channel.
         target: The target image, likewise.
-        ray: The points' rays in the reference camera.
-        rho: Their predicted inverse ranges, 1/m.
+        ray: The points' unit rays in the reference camera.
+        rho: Their predicted inverse distances, 1/m.
         variance: Of the predictions.
         slope: Gradient magnitude at the points, intensity per pixel.
         T_tgt_ref: The known motion.
@@ -165,10 +166,9 @@ def _reference_samples(
     reference: Target, ray: Float[Tensor, "3 N"], circles: _Circles, T: Float[Tensor, "4 4"], step: float
 ) -> Float[Tensor, "N 5"]:
     """Look up five samples of the reference along each point's own epipolar curve, one pixel apart."""
-    unit = ray / torch.linalg.vector_norm(ray, dim=0)
     towards = T[:3, :3].mT @ circles.towards
     angle = torch.arange(-HALF_PATTERN, HALF_PATTERN + 1, dtype=ray.dtype, device=ray.device) * step
-    return look_up_value(reference, unit[..., None] * angle.cos() + towards[..., None] * angle.sin())
+    return look_up_value(reference, ray[..., None] * angle.cos() + towards[..., None] * angle.sin())
 
 
 def _search(

@@ -106,8 +106,8 @@ def moved_points(key: Keyframe, T_cam_key: Float64[Tensor, "4 4"]) -> tuple[Floa
     T = T_cam_key.to(key.ray.dtype)
     rho = key.points.rho
     Y = T[:3, :3] @ key.ray + rho * T[:3, 3:]
-    length = torch.linalg.vector_norm(Y, dim=0).clamp_min(1e-12)
-    return Y / length, rho / length
+    inv_length = Y.square().sum(0).clamp_min(1e-24).rsqrt()
+    return Y * inv_length, rho * inv_length
 
 
 @dataclass(frozen=True)
@@ -200,7 +200,7 @@ def median_parallax(key: Keyframe, T_cam_key: Float64[Tensor, "4 4"], usable: Bo
         return 0.0
     moved, _ = moved_points(key, T_cam_key)
     turned = T_cam_key[:3, :3].to(key.ray.dtype) @ key.ray
-    cross = torch.linalg.vector_norm(torch.linalg.cross(turned, moved, dim=0), dim=0)
+    cross = torch.linalg.cross(turned, moved, dim=0).square().sum(0).sqrt()
     return float(torch.atan2(cross, (turned * moved).sum(0))[usable].median())
 
 

@@ -8,7 +8,7 @@ from jaxtyping import Float64, Int64
 from torch import Tensor
 
 from torchvo360 import lie
-from torchvo360.agreement import agreeing_share
+from torchvo360.agreement import share_of_samples
 from torchvo360.alignment import AlignConfig, solve_level
 from torchvo360.checks import InputError
 from torchvo360.residuals.direct import Reference, look_up
@@ -31,7 +31,7 @@ class TrackConfig:
     """Residual at which the cost turns linear."""
     cutoff: float = 34 / 255
     """Residuals beyond this weigh nothing, but on the coarsest level all count."""
-    solver: LMConfig = field(default_factory=lambda: LMConfig(cost_tolerance=1e-3, step_tolerance=0.02))
+    solver: LMConfig = field(default_factory=lambda: LMConfig(cost_tolerance=1e-3, step_tolerance=0.05))
     min_points: int = 60
     """Fewer trusted points cannot be tracked."""
 
@@ -135,5 +135,5 @@ def measure(
     )
     weight = samples.weight.sum().clamp_min(1e-9)
     residual = float((samples.residual.abs() * samples.weight).sum() / weight)
-    inliers = float(agreeing_share(reference, frame.targets[0], T_cam_key[None], affine[None])[0])
+    inliers = float(share_of_samples(samples, frame.targets[0].camera)[0])
     return Track(T_cam_key, affine, residual, inliers)

@@ -30,6 +30,9 @@ from torchvo360.residuals.normal import NormalEquations
 from torchvo360.residuals.weights import LossConfig
 from torchvo360.solve import LMConfig, Solution, Status, inverse_ldl, minimize
 
+MAX_RHO = 1e9
+"""Inverse ranges above this, 1/m, are no range of anything; their squares would overflow in float32."""
+
 
 @dataclass(kw_only=True)
 class AlignConfig:
@@ -67,10 +70,15 @@ class AlignConfig:
         check_finite_number("noise", self.noise, above=0)
 
     def level_count(self, camera: Camera) -> int:
-        """Return the number of pyramid levels for a camera."""
-        if self.levels:
-            return self.levels
-        return 1 + max(0, math.floor(math.log2(max(1.0, camera.width / self.coarsest_width))))
+        """Return the number of pyramid levels for a camera.
+
+        Raises:
+            InputError: The finest level is not one of them.
+        """
+        count = self.levels or 1 + max(0, math.floor(math.log2(max(1.0, camera.width / self.coarsest_width))))
+        if self.finest >= count:
+            raise InputError(f"finest: expected a level below {count}, the number of levels, got {self.finest}.")
+        return count
 
 
 @dataclass(frozen=True)
@@ -131,8 +139,8 @@ def _levels(
     ref, ref_finite = _finite(ref)
     tgt, tgt_finite = _finite(tgt)
     known = (
-        torch.isfinite(rho)
-        & (rho >= 0)
+        (rho >= 0)
+        & (rho <= MAX_RHO)
         & usable
         & (ref_finite if bool(ref_finite.all()) else _erode(ref_finite, camera))
     )
@@ -158,9 +166,9 @@ def _levels(
         B = ref.shape[0]
         reference = Reference(
             ray=at.ray_grid(dtype=ref.dtype, device=ref.device).permute(2, 0, 1).reshape(1, 3, -1).contiguous(),
-            rho=(level_rho / 1.0).reshape(B, -1).contiguous(),
+            rho=level_rho.flatten(1).contiguous(),
             value=ref.flatten(2).contiguous(),
-            weight=each.reshape(B, -1).contiguous(),
+            weight=each.flatten(1).contiguous(),
         )
         levels.append(_Level(at, reference, make_target(tgt, at, confidence, saturation)))
     return levels
@@ -273,8 +281,8 @@ def align(
         InputError: A tensor is not floating, a weight is negative or a start is not a rigid motion.
     """
     config = AlignConfig() if config is None else config
-    batch = ref.shape[:-3]
     check_shape("ref", ref, f"... C {camera.height} {camera.width}")
+    batch = ref.shape[:-3]
     for name, value, expected in (
         ("tgt", tgt, ref.shape),
         ("rho", rho, (*batch, *ref.shape[-2:])),

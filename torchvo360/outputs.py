@@ -3,6 +3,7 @@
 import csv
 import importlib.metadata
 import importlib.util
+import itertools
 import json
 import math
 import platform
@@ -61,50 +62,58 @@ def can_plot() -> bool:
     return importlib.util.find_spec("matplotlib") is not None
 
 
-def new_folder(parent: Path) -> Path:
-    """Make a folder named by date and time, with a number behind it where another run has the same second."""
+@contextmanager
+def new_folder(out: str | None, parent: Path) -> Iterator[Path]:
+    """Make a folder for results, and take it away again if nothing has been put into it.
+
+    Args:
+        out: Where the user wants it; it may exist.
+        parent: Otherwise the folder is made in here, named by date and time, with a number behind it where another one
+            has the same second.
+
+    Raises:
+        InputError: It cannot be written.
+    """
+    wanted = parent if out is None else Path(out).expanduser()
+    made = [path for path in (wanted, *wanted.parents) if not path.exists()]
+    try:
+        try:
+            wanted.mkdir(parents=True, exist_ok=True)
+            folder = wanted
+            if out is None:
+                folder = _dated_folder(parent)
+                made.insert(0, folder)
+            tempfile.TemporaryFile(dir=folder).close()
+        except OSError as error:
+            raise InputError(f"out: expected a folder that can be written, got {wanted}: {error.strerror}.") from None
+        yield folder
+    finally:
+        for path in made:
+            with suppress(OSError):  # not empty: results, or another run's
+                path.rmdir()
+
+
+def _dated_folder(parent: Path) -> Path:
     name = datetime.now().strftime("%Y-%m-%d_%H-%M-%S")
-    parent.mkdir(parents=True, exist_ok=True)
-    for number in range(1, 10_000):
+    for number in itertools.count(1):
         folder = parent / (name if number == 1 else f"{name}_{number}")
         with suppress(FileExistsError):
             folder.mkdir()
             return folder
-    raise InputError(f"out: expected fewer than 10000 runs in a second, got more in {parent}.")
+    raise AssertionError  # the count does not end
 
 
 @contextmanager
 def output_folder(out: str | None, name: str, *, overwrite: bool) -> Iterator[Path]:
-    """Make the folder of a run and take it away again if nothing has been put into it.
-
-    Args:
-        out: Where the user wants it; None for runs/<name>/<date_time>.
-        name: Of the input.
-        overwrite: Whether `out` may hold another run.
+    """Make the folder of a run of the input of this name, by default runs/<name>/<date_time>.
 
     Raises:
-        InputError: It cannot be written, or holds another run.
+        InputError: It cannot be written, or holds another run that is not to be overwritten.
     """
-    wanted = Path("runs", name) if out is None else Path(out).expanduser()
-    made = [path for path in (wanted, *wanted.parents) if not path.exists()]
-    try:
-        try:
-            if out is None:
-                folder = new_folder(wanted)
-                made.insert(0, folder)
-            else:
-                folder = wanted
-                folder.mkdir(parents=True, exist_ok=True)
-            tempfile.TemporaryFile(dir=folder).close()
-        except OSError as error:
-            raise InputError(f"out: expected a folder that can be written, got {wanted}: {error.strerror}.") from None
+    with new_folder(out, Path("runs", name)) as folder:
         if not overwrite and any((folder / file).exists() for file in FILES):
             raise InputError(f"out: expected a folder without a run, or overwrite=true, got {folder}, which holds one.")
         yield folder
-    finally:
-        for path in made:
-            with suppress(OSError):  # not empty: another run's, or results
-                path.rmdir()
 
 
 def write_all(folder: Path, record: Record) -> dict[str, Any]:

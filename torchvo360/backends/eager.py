@@ -39,7 +39,7 @@ def linearize(
     C = reference.value.shape[1]
     dtype = reference.value.dtype
     T, ab = T_tgt_ref.to(dtype), affine.to(dtype)
-    size = max(256, CHUNK_SAMPLES // (B * C))
+    size = max(256, CHUNK_SAMPLES // max(1, B * C))
     M = T_tgt_ref.new_zeros(B, 9, 9)
     cost, total = T_tgt_ref.new_zeros(B), T_tgt_ref.new_zeros(B)
     for start in range(0, N, size):
@@ -52,13 +52,21 @@ def linearize(
             by_depth, slope = depth_variance_weight(by_rho(samples, t), points.variance[:, None], noise)
             robust_weight, robust_cost = robust(residual * by_depth.sqrt(), loss)
             robust_weight = robust_weight * by_depth
-            slope_rows = weight_slope_rows(samples, slope * residual * (weight * robust_weight).sqrt(), t)
+            slope_rows = weight_slope_rows(samples, slope * residual * _root(weight * robust_weight), t)
         else:
             robust_weight, robust_cost = robust(residual, loss)
-        S = system_rows(samples, (weight * robust_weight).sqrt())
+        S = system_rows(samples, _root(weight * robust_weight))
         if slope_rows is not None:
             S[:, :6] += slope_rows
         M = M + torch.bmm(S, S.mT)
         cost = cost + (weight * robust_cost).sum((1, 2))
-        total = total + weight.sum((1, 2)) * C
+        total = total + weight.sum((1, 2)) * (C / weight.shape[1])
     return NormalEquations(M[:, :8, :8], M[:, :8, 8], cost, total, M[:, 8, 8])
+
+
+def _root(weight: Float[Tensor, "B C N"]) -> Float[Tensor, "B C N"]:
+    """Return the square root, with a zero gradient at zero, where the bare root's is infinite."""
+    if not weight.requires_grad:
+        return weight.sqrt()
+    positive = weight > 0
+    return torch.where(positive, weight, 1.0).sqrt() * positive

@@ -2,7 +2,6 @@
 
 import sys
 from collections.abc import Sequence
-from contextlib import suppress
 from functools import partial
 from pathlib import Path
 from typing import cast
@@ -41,41 +40,25 @@ def run_sweep(overrides: Sequence[str], conf: Path) -> int:
         InputError: The overrides are no sweep of ours, or its folder cannot be written or holds files.
     """
     check_keys(overrides)
-    outs = [override.removeprefix("out=") for override in overrides if override.startswith("out=")]
-    overrides = [override for override in overrides if not override.startswith("out=")]
-    folder = _sweep_folder(outs[-1] if outs else None)
-    try:
-        with hydra_ready(conf):
-            hydra = GlobalHydra.instance().hydra
-            assert hydra is not None
-            arguments = [*overrides, f"hydra.sweep.dir={quoted(str(folder))}"]
+    out = next((text.removeprefix("out=") for text in reversed(overrides) if text.startswith("out=")), None)
+    if out is not None and "," in out:
+        raise InputError(f"out: expected one folder for the whole sweep, got {out}.")
+    with new_folder(out, Path("runs", "sweep")) as folder, hydra_ready(conf):
+        if any(folder.iterdir()):
+            raise InputError(f"out: expected a new or empty folder for a sweep, got {out}, which holds files.")
+        hydra = GlobalHydra.instance().hydra
+        assert hydra is not None
+        arguments = [text for text in overrides if not text.startswith("out=")]
+        arguments.append(f"hydra.sweep.dir={quoted(str(folder))}")
+        try:
             job = partial(_job, conf=conf)
             batches = explained(hydra.multirun, arguments, task_function=job, with_log_configuration=False)
-    except SystemExit as stopped:
-        return cast("int", stopped.code)
-    finally:
-        if not any(path.is_dir() for path in folder.iterdir()):  # no job left anything
-            (folder / "multirun.yaml").unlink(missing_ok=True)
-            with suppress(OSError):
-                folder.rmdir()
-    return max(job.return_value for batch in batches for job in batch)
-
-
-def _sweep_folder(out: str | None) -> Path:
-    try:
-        if out is None:
-            return new_folder(Path("runs", "sweep"))
-        if "," in out:
-            raise InputError(f"out: expected one folder for the whole sweep, got {out}.")
-        folder = Path(out).expanduser()
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise InputError(
-            f"out: expected a folder that can be written, got {error.filename}: {error.strerror}."
-        ) from None
-    if any(folder.iterdir()):
-        raise InputError(f"out: expected a new or empty folder for a sweep, got {out}, which holds files.")
-    return folder
+        except SystemExit as stopped:
+            return cast("int", stopped.code)
+        finally:
+            if not any(path.is_dir() for path in folder.iterdir()):  # no job left anything
+                (folder / "multirun.yaml").unlink(missing_ok=True)
+        return max(job.return_value for batch in batches for job in batch)
 
 
 def _job(_: DictConfig, conf: Path) -> int:

@@ -19,8 +19,10 @@ from torchvo360.residuals.weights import LossConfig
 from torchvo360.solve import LMConfig, Solution, minimize
 
 ROTATION_AND_BRIGHTNESS = (False, False, False, True, True, True, True, True)
-REFINED = 16
+REFINED = 6
 """Candidates of the global search that are refined."""
+SCORED_POINTS = 700
+"""Points of the reference, evenly thinned, by which the grid's rotations are ranked."""
 
 
 @dataclass(frozen=True)
@@ -56,7 +58,7 @@ def align_rotation(
     target: Target,
     R_tgt_ref: Float[Tensor, "K 3 3"],
     *,
-    max_steps: int = 20,
+    max_steps: int = 30,
     loss: LossConfig | None = None,
 ) -> RotationResult:
     """Refine rotations and brightness from K starts in one batch; the points are taken at infinity.
@@ -89,7 +91,7 @@ def align_rotation(
         evaluate,
         retract,
         (lie.se3(R_tgt_ref, R_tgt_ref.new_zeros(K, 3)), R_tgt_ref.new_zeros(K, 2)),
-        LMConfig(max_steps=max_steps, cost_tolerance=1e-3),
+        LMConfig(max_steps=max_steps, cost_tolerance=1e-4),
         step_scale=scale * free,
         free=free,
         min_weight=1.0,
@@ -117,12 +119,14 @@ def search_rotation(
         refined: How many of the best are refined.
     """
     dtype = reference.value.dtype
-    directions = torch.einsum("mij,jn->mni", grid.to(dtype), reference.ray[0])
+    stride = max(1, reference.rho.shape[1] // SCORED_POINTS)
+    directions = torch.einsum("mij,jn->mni", grid.to(dtype), reference.ray[0, :, ::stride])
     inside = target.padded[..., 1:-1, 1:-1]
     value = sample(inside, target.camera.pixel(directions).flatten(0, 1)[None], target.camera)[0, 0]
     value = value.view(grid.shape[0], -1)
-    weight = reference.weight / reference.weight.sum().clamp_min(1e-9)
-    known = reference.value[0, :1]
+    weight = reference.weight[:, ::stride]
+    weight = weight / weight.sum().clamp_min(1e-9)
+    known = reference.value[0, :1, ::stride]
     centred = known - (weight * known).sum()
     value = value - (weight * value).sum(-1, keepdim=True)
     spread = (weight * value.square()).sum(-1) * (weight * centred.square()).sum()

@@ -128,18 +128,20 @@ def look_up(
     """
     R, t = T_tgt_ref[:, :3, :3], T_tgt_ref[:, :3, 3:]
     Y = torch.baddbmm(t * reference.rho[:, None], R, reference.ray.expand(R.shape[0], -1, -1))
-    x, y, z = Y.unbind(1)
     camera = target.camera
-    inv_scale = camera.scale_of(x, y, z).reciprocal()
-    u, v = camera.pixel_of(x, y, z)
-    taps = locate(u, v, camera)
-    value, g_u, g_v = interpolate(target.padded, taps)
     weight = reference.weight
+    if not camera.wraps:
+        seen = camera.sees(Y.mT, torch.stack(camera.pixel_of(*Y.unbind(1)), -1), margin=0.5)
+        if seen is not None:
+            # Points out of view stand in as one ahead: behind a pinhole their rays would be of any size.
+            Y = torch.where(seen[:, None], Y, Y.new_tensor([0.0, 0.0, 1.0])[:, None])
+            weight = weight * seen
+    x, y, z = Y.unbind(1)
+    inv_scale = camera.scale_of(x, y, z).reciprocal()
+    taps = locate(*camera.pixel_of(x, y, z), camera)
+    value, g_u, g_v = interpolate(target.padded, taps)
     if target.confidence is not None:
         weight = weight * interpolate(target.confidence, taps).value[:, 0]
-    seen = None if camera.wraps else camera.sees(Y.mT, torch.stack([u, v], -1), margin=0.5)
-    if seen is not None:
-        weight = weight * seen
     each = weight[:, None]
     if target.saturation is not None:
         each = each * (value < target.saturation)

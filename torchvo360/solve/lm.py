@@ -151,7 +151,7 @@ def minimize(
         accepted = usable & (gained > 0)
 
         small = torch.linalg.vector_norm(delta * step_scale[active], dim=-1) < config.step_tolerance
-        little = torch.where(accepted, gained, promised) < config.cost_tolerance * cost
+        little = torch.where(accepted, gained, promised) <= config.cost_tolerance * cost
         converged = solvable & torch.where(accepted, small | little, little & (promised >= 0))
         singular = ~solvable & (damping.value >= 1)
         stalled = ~accepted & (damping.value >= config.max_damping) & ~converged & ~singular

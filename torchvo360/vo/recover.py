@@ -1,18 +1,23 @@
 """What is tried when tracking is weak: the rotation since the last frame, then every rotation there is."""
 
+from dataclasses import replace
+
 import torch
 from jaxtyping import Float64
 from torch import Tensor
 
 from torchvo360 import lie
+from torchvo360.image import blur, pad_image
 from torchvo360.motion.rotation import align_rotation, rotation_grid, search_rotation
 from torchvo360.residuals.direct import Reference, Target
 from torchvo360.vo.frame import FrameBuilder, PyramidFrame
 from torchvo360.vo.map import Keyframe
 from torchvo360.vo.track import Track, TrackConfig, track
 
-GRID_STEP_RAD = 0.6
-"""Spacing of the global search: the refinement at 64 x 32 converges from 40 deg."""
+GRID_STEP_RAD = 0.43
+"""Spacing of the global search, about a thousand rotations: none is farther than 16 deg from one of them."""
+BLUR_PX = 1.0
+"""Smoothing of the small images: it widens the basin of the refinement."""
 KEPT = 3
 """Rotations of a global search that are tracked."""
 
@@ -27,6 +32,12 @@ class Recovery:
         area = camera.solid_angle(camera.pixel_grid(device=builder.device))
         self._weight = (area / area.mean()).reshape(1, -1)
         self._grid = rotation_grid(GRID_STEP_RAD).to(builder.device)
+
+    def _small(self, frame: PyramidFrame) -> Target:
+        """Return the coarsest level, smoothed further."""
+        target = frame.targets[-1]
+        image = blur(target.padded[..., 1:-1, 1:-1], target.camera, BLUR_PX)
+        return replace(target, padded=pad_image(image, target.camera, 1).contiguous())
 
     def _points(self, target: Target) -> Reference:
         value = target.padded[..., 1:-1, 1:-1].reshape(1, 1, -1)
@@ -56,7 +67,7 @@ class Recovery:
         """
         tries = []
         if last is not None:
-            small, before = frame.targets[-1], self._points(last.targets[-1])
+            small, before = self._small(frame), self._points(self._small(last))
             eye = torch.eye(3, dtype=torch.float64, device=self._grid.device)[None]
             tries.append(align_rotation(before, small, eye))
             tries.append(search_rotation(before, small, self._grid))
@@ -70,6 +81,6 @@ class Recovery:
 
     def relocalise(self, key: Keyframe, frame: PyramidFrame) -> Track | None:
         """Return where a frame stands against an earlier keyframe, from any orientation at about its place."""
-        R = search_rotation(self._points(key.frame.targets[-1]), frame.targets[-1], self._grid).R_tgt_ref[:KEPT]
+        R = search_rotation(self._points(self._small(key.frame)), self._small(frame), self._grid).R_tgt_ref[:KEPT]
         start = lie.se3(R, R.new_zeros(R.shape[0], 3))
         return track(key, frame, start, torch.zeros(2, dtype=torch.float64), self._config, self._limit)

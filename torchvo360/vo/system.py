@@ -45,10 +45,10 @@ class OdometryConfig:
     """Smoothing of every frame: 0.5 for clean images, 0.7 for compressed video."""
     saturation: float = 252 / 255
     """Intensities at or above this are clipped and not used."""
-    weak_inliers: float = 0.5
+    weak_inliers: float = 0.65
     """Share of agreeing gradient below which the other hypotheses are searched, and the frame is WEAK."""
-    lost_inliers: float = 0.3
-    """Share below which the frame is LOST: false minima reach this much."""
+    lost_inliers: float = 0.5
+    """Share below which the frame is LOST: false minima reach 0.43."""
     remembered_keyframes: int = 8
     """Earlier keyframes that a lost frame is compared with."""
     restart_after: int = 15
@@ -214,7 +214,7 @@ class VisualOdometry:
             found = track(
                 key, pending, guess[None], torch.zeros(2, dtype=torch.float64), self.config.track, self._limit
             )
-            if found is not None and found.inliers > self.config.weak_inliers:
+            if found is not None and found.inliers >= self.config.weak_inliers:
                 known[pending.index] = found.T_cam_key
                 if pending is not frame:
                     self._fuse(key, pending, found)
@@ -228,7 +228,7 @@ class VisualOdometry:
         xi = lie.se3_log(self._T_cam_key @ lie.se3_inverse(before)) / gap
         self._motion = lie.se3_exp(xi)
         found = track(key, frame, self._T_cam_key[None], self._affine, self.config.track, self._limit)
-        if found is not None and found.inliers > self.config.weak_inliers:
+        if found is not None and found.inliers >= self.config.weak_inliers:
             self._T_cam_key, self._affine = found.T_cam_key, found.affine
             self._fuse(key, frame, found)
         state = State.RELOCALISED if again else State.TRACKING

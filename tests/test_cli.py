@@ -483,45 +483,45 @@ def start(*arguments: str) -> subprocess.Popen[str]:
     )
 
 
-@pytest.mark.parametrize(("name", "code"), [("SIGINT", 130), ("SIGTERM", 143)])
-def test_a_signal_ends_the_run_and_keeps_what_was_done(name, code):
-    process = start(*SYNTHETIC, "synthetic.frames=100000", "synthetic.motion=still", "threads=1", "out=x")
-    for _ in range(600):
-        if Path("x").exists():
-            break
-        time.sleep(0.1)
-    time.sleep(0.5)  # some frames
-    process.send_signal(getattr(signal, name))
-    out, err = process.communicate(timeout=60)
-    assert process.returncode == code, err
-    assert err == ""
-    assert f"note: stopped by {name} after " in out
-    assert {path.name for path in Path("x").iterdir()} == WITHOUT_PICTURE
-    frames = summary_of(Path("x"))["frames"]
-    assert 2 <= frames < 100000
-    assert len(read_tum("x/trajectory.txt")) == frames
+def test_a_signal_ends_the_run_and_keeps_what_was_done():
+    codes = {"SIGINT": 130, "SIGTERM": 143}
+    endless = [*SYNTHETIC, "synthetic.frames=100000", "synthetic.motion=still", "threads=1"]
+    processes = {name: start(*endless, f"out={name}") for name in codes}
+    for name, process in processes.items():
+        while not Path(name).exists():
+            assert process.poll() is None
+            time.sleep(0.05)
+    time.sleep(0.7)  # some frames
+    for name, process in processes.items():
+        process.send_signal(getattr(signal, name))
+    for name, process in processes.items():
+        out, err = process.communicate(timeout=60)
+        assert (process.returncode, err) == (codes[name], "")
+        assert f"note: stopped by {name} after " in out
+        assert {path.name for path in Path(name).iterdir()} == WITHOUT_PICTURE
+        frames = summary_of(Path(name))["frames"]
+        assert 2 <= frames < 100000
+        assert len(read_tum(Path(name) / "trajectory.txt")) == frames
 
 
-def test_a_signal_ends_a_sweep():
-    process = start(
-        "-m", *SYNTHETIC, "synthetic.frames=100000", "synthetic.motion=still", "threads=1", "seed=0,1", "out=x"
-    )
-    for _ in range(600):
-        if Path("x/0").exists():
-            break
-        time.sleep(0.1)
-    time.sleep(0.5)
-    process.send_signal(signal.SIGINT)
-    process.communicate(timeout=60)
-    assert process.returncode == 130
+def test_a_signal_ends_a_sweep(images, monkeypatch):
+    step = VisualOdometry.step
+
+    def stopped(self, frame):
+        if frame.index == 2:
+            os.kill(os.getpid(), signal.SIGINT)
+        return step(self, frame)
+
+    monkeypatch.setattr(VisualOdometry, "step", stopped)
+    assert main(["-m", "input=images", "seed=0,1", "plot=false", "out=x"]) == 130
     assert {path.name for path in Path("x").iterdir()} == {"0", "multirun.yaml"}
+    assert summary_of(Path("x/0"))["frames"] == 3
 
 
 def test_the_command_runs_as_a_process_from_any_folder(images):
-    process = start("input=images", "plot=false")
-    out, err = process.communicate(timeout=60)
-    assert (process.returncode, err) == (0, "")
+    good, bad = start("input=images", "plot=false"), start("input=nowhere")
+    out, err = good.communicate(timeout=60)
+    assert (good.returncode, err) == (0, "")
     assert f"results: {only_run('images')}" in out
-    process = start("input=nowhere")
-    out, err = process.communicate(timeout=60)
-    assert (process.returncode, out, err.count("\n")) == (2, "", 1)
+    out, err = bad.communicate(timeout=60)
+    assert (bad.returncode, out, err.count("\n")) == (2, "", 1)

@@ -101,7 +101,7 @@ class AlignResult:
     variance: Float[Tensor, "*batch"]
     """Variance of a residual at the end."""
     agreement: Float[Tensor, "*batch"]
-    """Share of the image gradient that is matched to within half a pixel, 0 to 1."""
+    """Share of the image gradient that is matched to within half a pixel beyond chance, 0 to 1."""
 
     def covariance(self) -> Float[Tensor, "*batch 8 8"]:
         """Return the covariance of (v, w, a, b) about the solution, `variance * H^-1`; infinite where H is singular.

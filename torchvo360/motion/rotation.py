@@ -11,6 +11,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from torchvo360 import lie
+from torchvo360.agreement import agreeing_share
 from torchvo360.backends import linearize
 from torchvo360.image import sample
 from torchvo360.residuals.direct import Reference, Target
@@ -21,17 +22,20 @@ from torchvo360.solve import LMConfig, Solution, minimize
 ROTATION_AND_BRIGHTNESS = (False, False, False, True, True, True, True, True)
 REFINED = 6
 """Candidates of the global search that are refined."""
-SCORED_POINTS = 700
+SCORED_POINTS = 500
 """Points of the reference, evenly thinned, by which the grid's rotations are ranked."""
 
 
 @dataclass(frozen=True)
 class RotationResult:
-    """Rotations R_tgt_ref with the robust cost of each, the best first."""
+    """Rotations R_tgt_ref, the one of lowest robust cost first."""
 
     R_tgt_ref: Float[Tensor, "K 3 3"]
     affine: Float[Tensor, "K 2"]
+    """Brightness (a, b)."""
     cost: Float[Tensor, "K"]
+    agreement: Float[Tensor, "K"]
+    """Share of the gradient that is matched to within half a pixel, 0 to 1."""
 
 
 def rotation_grid(step_rad: float) -> Float[Tensor, "M 3 3"]:
@@ -98,7 +102,8 @@ def align_rotation(
     )
     cost = solution.equations.cost / solution.equations.weight.clamp_min(1e-9)
     order = cost.argsort(stable=True)
-    return RotationResult(solution.state[0][order, :3, :3], solution.state[1][order], cost[order])
+    T, affine = (part[order] for part in solution.state)
+    return RotationResult(T[:, :3, :3], affine, cost[order], agreeing_share(points, images, T, affine))
 
 
 def search_rotation(

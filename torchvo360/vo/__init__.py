@@ -1,7 +1,8 @@
 """Visual odometry: from frames to poses and a map."""
 
-from torchvo360.vo.map import PointCloud
+from torchvo360.vo.cloud import PointCloud
+from torchvo360.vo.config import OdometryConfig
 from torchvo360.vo.state import FrameEstimate, State
-from torchvo360.vo.system import OdometryConfig, OdometryResult, VisualOdometry
+from torchvo360.vo.system import OdometryResult, VisualOdometry
 
 __all__ = ["FrameEstimate", "OdometryConfig", "OdometryResult", "PointCloud", "State", "VisualOdometry"]

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from torchvo360.cameras import Camera
 from torchvo360.image import gradient_magnitude, level_camera, pad_image, resample
-from torchvo360.residuals.direct import Target
+from torchvo360.residuals.direct import Target, look_up_value
 
 
 @dataclass(frozen=True)
@@ -25,6 +25,10 @@ class PyramidFrame:
     """For the map's points."""
     targets: list[Target]
     """Smoothed grey levels in [0, 1], the finest first, padded for look-up; batch 1, one channel."""
+
+    def value(self, ray: Float[Tensor, "3 *points"]) -> Float[Tensor, "*points"]:
+        """Return the finest level's intensities along rays; NaN where the camera does not see them."""
+        return look_up_value(self.targets[0], ray)
 
     @property
     def image(self) -> Float[Tensor, "H W"]:

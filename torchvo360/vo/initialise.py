@@ -6,7 +6,7 @@ refinement settles all. Until then every frame gets a rotation, and the initiali
 """
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import torch
@@ -20,10 +20,10 @@ from torchvo360.depth import EpipolarConfig, FilterConfig, InverseRange, fuse, s
 from torchvo360.motion.essential import TwoView, estimate_two_view
 from torchvo360.motion.flow import bearings, find_corners, follow
 from torchvo360.motion.rotation import fit_rotation
-from torchvo360.residuals.direct import Reference, Target, look_up_value
+from torchvo360.residuals.direct import Reference, Target
 from torchvo360.residuals.weights import LossConfig
 from torchvo360.vo.frame import FrameBuilder, PyramidFrame
-from torchvo360.vo.map import Keyframe, MapConfig, make_keyframe
+from torchvo360.vo.keyframe import Keyframe, MapConfig, make_keyframe
 from torchvo360.vo.refine import pattern_rays, refine_jointly
 from torchvo360.vo.track import TrackConfig
 
@@ -67,6 +67,13 @@ class Start:
     """By frame index, for some of the frames, the newest included."""
     affine: Float64[Tensor, "2"]
     """Of the newest frame."""
+
+    def rescaled(self, unit: float) -> "Start":
+        """Return the start with a median inverse range of `unit` instead of 1."""
+        rho, variance, score = self.key.points
+        self.key.points = InverseRange(rho * unit, variance * unit**2, score)
+        poses = {index: lie.se3(T[:3, :3], T[:3, 3] / unit) for index, T in self.T_cam_key.items()}
+        return replace(self, T_cam_key=poses)
 
 
 @dataclass
@@ -162,7 +169,7 @@ class Initialiser:
         joint = refine_jointly(
             rays,
             key.points.rho[chosen],
-            look_up_value(reference.targets[0], rays),
+            reference.value(rays),
             _together([frame.targets[0] for frame in frames]),
             T,
             ab,

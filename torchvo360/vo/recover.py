@@ -1,6 +1,6 @@
-"""What is tried when tracking is weak: the rotation since the last frame, then every rotation there is."""
+"""What is tried when tracking is weak: the rotation since the last frame, every rotation, earlier keyframes."""
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Float64
@@ -11,7 +11,7 @@ from torchvo360.image import blur, pad_image
 from torchvo360.motion.rotation import align_rotation, rotation_grid, search_rotation
 from torchvo360.residuals.direct import Reference, Target
 from torchvo360.vo.frame import FrameBuilder, PyramidFrame
-from torchvo360.vo.map import Keyframe
+from torchvo360.vo.keyframe import Keyframe, KeyPoints
 from torchvo360.vo.track import Track, TrackConfig, track
 
 GRID_STEP_RAD = 0.43
@@ -20,6 +20,18 @@ BLUR_PX = 1.0
 """Smoothing of the small images: it widens the basin of the refinement."""
 KEPT = 3
 """Rotations of a global search that are tracked."""
+TRIED_PER_FRAME = 3
+"""Earlier keyframes that one lost frame is compared with; the next lost frame goes on where it ended."""
+MIN_AGREEMENT = 0.4
+"""Rotations that match less of the small images' gradient than this are not tracked: unrelated images reach 0.3."""
+
+
+@dataclass(frozen=True)
+class Remembered:
+    """What is kept of a keyframe: its points and one small image, a quarter of a megabyte."""
+
+    key: KeyPoints
+    small: Target
 
 
 class Recovery:
@@ -32,6 +44,14 @@ class Recovery:
         area = camera.solid_angle(camera.pixel_grid(device=builder.device))
         self._weight = (area / area.mean()).reshape(1, -1)
         self._grid = rotation_grid(GRID_STEP_RAD).to(builder.device)
+        self._remembered: list[Remembered] = []
+        self._turn = 0
+
+    def remember(self, key: Keyframe) -> None:
+        """Keep a keyframe for relocalisation."""
+        points = KeyPoints(key.T_world_key, key.pixel, key.ray, key.slope, key.values, key.points)
+        self._remembered.append(Remembered(points, self._small(key.frame)))
+        self._turn = 0
 
     def _small(self, frame: PyramidFrame) -> Target:
         """Return the coarsest level, smoothed further."""
@@ -55,7 +75,7 @@ class Recovery:
         affine: Float64[Tensor, "2"],
         found: Track | None,
     ) -> Track | None:
-        """Return the best of the weak track, tracks from the rotation since the last frame, and from all rotations.
+        """Return the best of a weak track, tracks from the rotation since the last frame, and from all rotations.
 
         Args:
             key: The keyframe.
@@ -65,22 +85,44 @@ class Recovery:
             affine: Brightness to start from.
             found: What was found so far.
         """
-        tries = []
-        if last is not None:
-            small, before = self._small(frame), self._points(self._small(last))
-            eye = torch.eye(3, dtype=torch.float64, device=self._grid.device)[None]
-            tries.append(align_rotation(before, small, eye))
-            tries.append(search_rotation(before, small, self._grid))
-        for attempt in tries:
-            R = attempt.R_tgt_ref[:KEPT]
-            turn = lie.se3(R, R.new_zeros(R.shape[0], 3))
-            tracked = track(key, frame, turn @ T_last_key, affine, self._config, self._limit)
+        if last is None:
+            return found
+        small, before = self._small(frame), self._points(self._small(last))
+        eye = torch.eye(3, dtype=torch.float64, device=self._grid.device)[None]
+        for attempt in (align_rotation(before, small, eye), search_rotation(before, small, self._grid)):
+            R = attempt.R_tgt_ref[:KEPT][attempt.agreement[:KEPT] >= MIN_AGREEMENT]
+            if R.shape[0] == 0:
+                continue
+            tracked = track(key, frame, _turns(R) @ T_last_key, affine, self._config, self._limit)
             if tracked is not None and (found is None or tracked.inliers > found.inliers):
                 found = tracked
         return found
 
-    def relocalise(self, key: Keyframe, frame: PyramidFrame) -> Track | None:
-        """Return where a frame stands against an earlier keyframe, from any orientation at about its place."""
-        R = search_rotation(self._points(self._small(key.frame)), self._small(frame), self._grid).R_tgt_ref[:KEPT]
-        start = lie.se3(R, R.new_zeros(R.shape[0], 3))
-        return track(key, frame, start, torch.zeros(2, dtype=torch.float64), self._config, self._limit)
+    def relocalise(self, frame: PyramidFrame, min_inliers: float) -> tuple[KeyPoints, Track] | None:
+        """Return an earlier keyframe in which a frame is found, from any orientation at about its place.
+
+        A few are tried, the newest first; the next call goes on with the older ones, and then begins again.
+
+        Args:
+            frame: The lost frame.
+            min_inliers: Share of agreeing gradient from which it counts as found.
+        """
+        small = self._small(frame)
+        count = len(self._remembered)
+        for _ in range(min(TRIED_PER_FRAME, count)):
+            place = self._remembered[count - 1 - self._turn % count]
+            self._turn += 1
+            rotations = search_rotation(self._points(place.small), small, self._grid)
+            R = rotations.R_tgt_ref[:KEPT][rotations.agreement[:KEPT] >= MIN_AGREEMENT]
+            if R.shape[0] == 0:
+                continue
+            brightness = rotations.affine[0]
+            found = track(place.key, frame, _turns(R), brightness, self._config, self._limit)
+            if found is not None and found.inliers >= min_inliers:
+                self._turn = 0
+                return place.key, found
+        return None
+
+
+def _turns(R: Float64[Tensor, "K 3 3"]) -> Float64[Tensor, "K 4 4"]:
+    return lie.se3(R, R.new_zeros(R.shape[0], 3))

@@ -15,7 +15,7 @@ from torchvo360.residuals.direct import Reference, look_up
 from torchvo360.residuals.weights import LossConfig
 from torchvo360.solve import LMConfig
 from torchvo360.vo.frame import PyramidFrame
-from torchvo360.vo.map import Keyframe
+from torchvo360.vo.keyframe import KeyPoints
 
 
 @dataclass(kw_only=True)
@@ -63,7 +63,7 @@ def _thinned(index: Int64[Tensor, "N"], count: int) -> Int64[Tensor, "M"]:
     return index[torch.arange(count, device=index.device) * index.numel() // count]
 
 
-def _reference(key: Keyframe, level: int, index: Int64[Tensor, "N"], B: int) -> Reference:
+def _reference(key: KeyPoints, level: int, index: Int64[Tensor, "N"], B: int) -> Reference:
     rho, variance, _ = key.points
     ray = key.ray[:, index]
     # Points are equal-area already: a further weight by solid angle would count it twice.
@@ -77,7 +77,7 @@ def _reference(key: Keyframe, level: int, index: Int64[Tensor, "N"], B: int) -> 
 
 
 def track(
-    key: Keyframe,
+    key: KeyPoints,
     frame: PyramidFrame,
     T_cam_key: Float64[Tensor, "K 4 4"],
     affine: Float64[Tensor, "2"],
@@ -122,7 +122,7 @@ def track(
 
 
 def measure(
-    key: Keyframe,
+    key: KeyPoints,
     frame: PyramidFrame,
     T_cam_key: Float64[Tensor, "4 4"],
     affine: Float64[Tensor, "2"],

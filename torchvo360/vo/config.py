@@ -1,0 +1,41 @@
+"""Settings of the odometry, composed of its parts' settings."""
+
+from dataclasses import dataclass, field
+
+from torchvo360.checks import InputError, check_finite_number
+from torchvo360.depth import EpipolarConfig, FilterConfig
+from torchvo360.vo.initialise import InitialiseConfig
+from torchvo360.vo.keyframe import MapConfig
+from torchvo360.vo.track import TrackConfig
+
+
+@dataclass(kw_only=True)
+class OdometryConfig:
+    """Settings of the odometry."""
+
+    coarsest_width: int = 64
+    """Pyramid levels go down to about this width."""
+    blur_px: float = 0.7
+    """Smoothing of every frame: 0.5 for clean images, 0.7 for compressed video."""
+    saturation: float = 252 / 255
+    """Intensities at or above this are clipped and not used."""
+    weak_inliers: float = 0.65
+    """Share of agreeing gradient below which the other hypotheses are searched, and the frame is WEAK."""
+    lost_inliers: float = 0.5
+    """Share below which the frame is LOST: false minima reach 0.43."""
+    restart_after: int = 15
+    """Lost frames in a row after which a new map is started and joined to the old one."""
+    initialise: InitialiseConfig = field(default_factory=InitialiseConfig)
+    track: TrackConfig = field(default_factory=TrackConfig)
+    map: MapConfig = field(default_factory=MapConfig)
+    epipolar: EpipolarConfig = field(default_factory=EpipolarConfig)
+    filter: FilterConfig = field(default_factory=FilterConfig)
+
+    def __post_init__(self) -> None:
+        check_finite_number("blur_px", self.blur_px, above=-1e-9)
+        check_finite_number("saturation", self.saturation, above=0)
+        check_finite_number("weak_inliers", self.weak_inliers, above=0, at_most=1)
+        check_finite_number("lost_inliers", self.lost_inliers, above=0, at_most=self.weak_inliers)
+        for name in ("coarsest_width", "restart_after"):
+            if getattr(self, name) < 1:
+                raise InputError(f"{name}: expected at least 1, got {getattr(self, name)}.")

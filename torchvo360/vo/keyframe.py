@@ -1,0 +1,119 @@
+"""Keyframes: a frame with points whose inverse ranges the filter keeps improving."""
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float, Float64, Int64
+from torch import Tensor
+
+from torchvo360.checks import InputError, check_finite_number
+from torchvo360.depth import InverseRange
+from torchvo360.image import equal_area_cells, select_pixels
+from torchvo360.residuals.direct import look_up_value
+from torchvo360.vo.carry import CarriedPoints
+from torchvo360.vo.frame import FrameBuilder, PyramidFrame
+
+
+@dataclass(kw_only=True)
+class MapConfig:
+    """Settings of keyframes and their points."""
+
+    points: int = 6000
+    """Equal-area cells over the whole sphere, each with at most one point."""
+    min_gradient: float = 4 / 255
+    """Least gradient of a point, intensity per pixel."""
+    keyframe_parallax_deg: float = 5.0
+    """Median parallax of the points at which a new keyframe is made; more often, and scale drifts."""
+    max_keyframe_gap: int = 40
+    """Frames after which a keyframe is made in any case, once there is some parallax."""
+    min_visible: float = 0.55
+    """Share of agreeing gradient below which a new keyframe is made, if there is some parallax."""
+    max_relative_variance: float = 0.05
+    """Points with V / rho^2 below this track and enter the point cloud."""
+
+    def __post_init__(self) -> None:
+        if self.points < 100:
+            raise InputError(f"points: expected at least 100, got {self.points}.")
+        if self.max_keyframe_gap < 1:
+            raise InputError(f"max_keyframe_gap: expected at least 1, got {self.max_keyframe_gap}.")
+        check_finite_number("min_gradient", self.min_gradient, above=0)
+        check_finite_number("keyframe_parallax_deg", self.keyframe_parallax_deg, above=0)
+        check_finite_number("max_relative_variance", self.max_relative_variance, above=0)
+
+
+@dataclass
+class KeyPoints:
+    """A keyframe's points: all that tracking against it needs."""
+
+    T_world_key: Float64[Tensor, "4 4"]
+    pixel: Int64[Tensor, "N"]
+    """Flat pixels of the finest level, in increasing order."""
+    ray: Float[Tensor, "3 N"]
+    """Unit rays in the keyframe's camera."""
+    slope: Float[Tensor, "N"]
+    """Gradient magnitude, intensity per pixel."""
+    values: list[Float[Tensor, "N"]]
+    """Intensity at each level, the finest first."""
+    points: InverseRange
+
+    def trusted(self, max_relative_variance: float) -> Bool[Tensor, "N"]:
+        """Return which points are good enough to track and to keep."""
+        rho, variance, score = self.points
+        return (score > 0) & (variance < max_relative_variance * rho * rho)
+
+    def moved(self, T_cam_key: Float64[Tensor, "4 4"]) -> tuple[Float[Tensor, "3 N"], Float[Tensor, "N"]]:
+        """Return the points in another camera: unit rays and inverse distances."""
+        T = T_cam_key.to(self.ray.dtype)
+        Y = T[:3, :3] @ self.ray + self.points.rho * T[:3, 3:]
+        inv_length = Y.square().sum(0).clamp_min(1e-24).rsqrt()
+        return Y * inv_length, self.points.rho * inv_length
+
+    def median_parallax(self, T_cam_key: Float64[Tensor, "4 4"]) -> float:
+        """Return the median angle by which the translation moves the points in use, radians; 0 without points."""
+        used = self.points.score > 0
+        if not bool(used.any()):
+            return 0.0
+        moved, _ = self.moved(T_cam_key)
+        turned = T_cam_key[:3, :3].to(self.ray.dtype) @ self.ray
+        cross = torch.linalg.cross(turned, moved, dim=0).square().sum(0).sqrt()
+        return float(torch.atan2(cross, (turned * moved).sum(0))[used].median())
+
+
+@dataclass
+class Keyframe(KeyPoints):
+    """Points with the frame they were chosen in, which the epipolar search compares with."""
+
+    frame: PyramidFrame
+
+
+def make_keyframe(
+    frame: PyramidFrame,
+    T_world_key: Float64[Tensor, "4 4"],
+    builder: FrameBuilder,
+    config: MapConfig,
+    carried: CarriedPoints | None = None,
+) -> Keyframe:
+    """Choose a frame's points: those carried over from the last keyframe, and new ones where they leave a cell empty.
+
+    New points' inverse ranges are guesses, with score 0: rho 1 and variance 1 without carried points.
+    """
+    camera = builder.cameras[0]
+    strength = builder.strength(frame)
+    usable = builder.usable(frame)
+    cell = equal_area_cells(camera, config.points, device=strength.device).flatten()
+    taken = torch.zeros(int(cell.max()) + 1, dtype=torch.bool, device=strength.device)
+    if carried is not None:
+        carried = carried.one_per_cell(cell[carried.pixel], usable.flatten() & (strength.flatten() > 0))
+        taken[cell[carried.pixel]] = True
+    pixel = select_pixels(
+        strength, usable & ~taken[cell].view_as(usable), camera, config.points, minimum=config.min_gradient
+    )
+    ray = builder.rays(pixel)
+    points = InverseRange(torch.ones_like(ray[0]), torch.ones_like(ray[0]), torch.zeros_like(ray[0]))
+    if carried is not None:
+        points = carried.guess(pixel, camera)
+        pixel, order = torch.cat([carried.pixel, pixel]).sort(stable=True)
+        ray = torch.cat([carried.ray, ray], 1)[:, order]
+        points = InverseRange(*(torch.cat(pair)[order] for pair in zip(carried.points, points, strict=True)))
+    values = [look_up_value(target, ray) for target in frame.targets]
+    return Keyframe(T_world_key, pixel, ray, strength.flatten()[pixel], values, points, frame)

@@ -17,15 +17,19 @@ from torchvo360 import lie
 from torchvo360.alignment import solve_level
 from torchvo360.checks import InputError, check_finite_number
 from torchvo360.depth import EpipolarConfig, FilterConfig, InverseRange, fuse, search_great_circles, smooth
-from torchvo360.motion.essential import TwoView, estimate_two_view
-from torchvo360.motion.flow import bearings, find_corners, follow
-from torchvo360.motion.rotation import fit_rotation
+from torchvo360.motion.essential import TwoView
 from torchvo360.residuals.direct import Reference, Target
 from torchvo360.residuals.weights import LossConfig
+from torchvo360.vo.corners import CornerTracks
 from torchvo360.vo.frame import FrameBuilder, PyramidFrame
 from torchvo360.vo.keyframe import Keyframe, MapConfig, make_keyframe
 from torchvo360.vo.refine import pattern_rays, refine_jointly
 from torchvo360.vo.track import TrackConfig
+
+CHECK_PARALLAX = 2.0
+"""A start is checked once the parallax is this many times its own."""
+CHECK_DIRECTION_DEG, CHECK_ROTATION_DEG = 8.0, 3.0
+"""Differences between a map and fresh corners beyond which the map is wrong: corners are within 3 and 0.5 deg."""
 
 
 @dataclass(kw_only=True)
@@ -87,6 +91,7 @@ class Initialiser:
     epipolar: EpipolarConfig
     filter: FilterConfig
     generator: torch.Generator
+    tracks: CornerTracks = field(default_factory=CornerTracks)
     pending: list[PyramidFrame] = field(default_factory=list)
     """The reference and the frames since."""
     rotations: dict[int, Float64[Tensor, "3 3"]] = field(default_factory=dict)
@@ -96,9 +101,7 @@ class Initialiser:
 
     def begin(self, frame: PyramidFrame) -> None:
         """Take a frame as the reference."""
-        usable = (self.builder.usable(frame)).cpu().numpy()
-        self._corners = find_corners(frame.grey, self.builder.cameras[0], self.config.corners, usable)
-        self._origins = bearings(self._corners, self.builder.cameras[0])
+        self.tracks = CornerTracks.found_in(frame, self.builder, self.config.corners)
         self.pending, self.rotations = [frame], {frame.index: torch.eye(3, dtype=torch.float64)}
         self.reason = "first_frame"
 
@@ -108,41 +111,74 @@ class Initialiser:
         `reason` then says why not: few_tracks, low_parallax, few_inliers, low_cheirality or refinement_failed;
         `pending[0]` is another frame if the reference had to be changed.
         """
-        camera = self.builder.cameras[0]
-        self._corners, ok = follow(self.pending[-1].grey, frame.grey, self._corners, camera)
-        self._corners, self._origins = self._corners[ok], self._origins[torch.from_numpy(ok)]
-        last = self.rotations[self.pending[-1].index]
-        if len(self._corners) < self.config.min_tracks:
+        if not self._follow(frame):
             self.begin(frame)
             self.reason = "few_tracks"
             return None
-        now = bearings(self._corners, camera)
-        self.rotations[frame.index] = fit_rotation(self._origins, now, last)
-        self.pending.append(frame)
-        start = self._attempt(frame, now)
+        view = self._view()
+        start = None if view is None else self._start(view)
         if start is None and len(self.pending) > self.config.max_pending:
             # The newest stays: the corners are in it.
             self.pending = self.pending[::2] + ([] if len(self.pending) % 2 else self.pending[-1:])
         return start
 
-    def _attempt(self, frame: PyramidFrame, now: Float64[Tensor, "N 3"]) -> Start | None:
-        turned = self._origins @ self.rotations[frame.index].mT
-        parallax = torch.linalg.vector_norm(torch.linalg.cross(turned, now), dim=-1).median()
+    def check(self, frame: PyramidFrame, T_cam_key: Float64[Tensor, "4 4"]) -> tuple[bool, Start | None]:
+        """Check a map by the corners' own direction, once they show more parallax than the start had.
+
+        A wrong start stays self-consistent for a hundred frames, and its residual hardly shows it (measured): only a
+        fresh, independent direction tells.
+
+        Args:
+            frame: The next frame.
+            T_cam_key: Where the map has it, against the start's keyframe.
+
+        Returns:
+            Whether the check is over (the map is confirmed or contradicted, or the corners have run out), and the start
+            that takes the map's place if it is contradicted.
+        """
+        gate = CHECK_PARALLAX * math.radians(self.config.parallax_deg)
+        if not self._follow(frame):
+            return True, None
+        if self.tracks.moved() < 0.3 * gate:
+            return False, None
+        view = self.tracks.two_view(self.generator)
+        if view is None or float(view.inlier.double().mean()) < self.config.min_inliers:
+            return True, None
+        if view.parallax < gate:
+            return False, None
+        t = T_cam_key[:3, 3]
+        cosine = float((view.t_tgt_ref * t).sum() / torch.linalg.vector_norm(t).clamp_min(1e-12))
+        turn = float(lie.so3_angle(view.R_tgt_ref @ T_cam_key[:3, :3].mT))
+        agrees = cosine > math.cos(math.radians(CHECK_DIRECTION_DEG)) and turn < math.radians(CHECK_ROTATION_DEG)
+        if agrees or view.cheirality < self.config.min_cheirality:
+            return True, None
+        return True, self._start(view)
+
+    def _follow(self, frame: PyramidFrame) -> bool:
+        """Follow the corners into a frame and keep it; False where too few are left."""
+        if self.tracks.follow(self.pending[-1], frame) < self.config.min_tracks:
+            return False
+        self.rotations[frame.index] = self.tracks.rotation(self.rotations[self.pending[-1].index])
+        self.pending.append(frame)
+        return True
+
+    def _view(self) -> TwoView | None:
+        """Return the motion of the newest frame if it can be trusted with a start; else `reason` says why not."""
+        gate = math.radians(self.config.parallax_deg)
         # What a rotation cannot explain is a lower bound of the parallax: far below the gate, spare the RANSAC.
-        if parallax < 0.3 * math.radians(self.config.parallax_deg):
+        if self.tracks.moved() < 0.3 * gate:
             self.reason = "low_parallax"
             return None
-        view = estimate_two_view(self._origins, now, self.generator)
+        view = self.tracks.two_view(self.generator)
         if view is None or float(view.inlier.double().mean()) < self.config.min_inliers:
             self.reason = "few_inliers"
-            return None
-        if view.parallax < math.radians(self.config.parallax_deg):
+        elif view.parallax < gate:
             self.reason = "low_parallax"
-            return None
-        if view.cheirality < self.config.min_cheirality:
+        elif view.cheirality < self.config.min_cheirality:
             self.reason = "low_cheirality"
-            return None
-        return self._start(view)
+        else:
+            return view
+        return None
 
     def _start(self, view: TwoView) -> Start | None:
         reference, newest = self.pending[0], self.pending[-1]
@@ -152,7 +188,7 @@ class Initialiser:
         t = view.t_tgt_ref * unit
         rho = view.rho[ahead] / unit
         near = (rho > 0.02) & (rho < 10)
-        key.points = _spread(key.ray, self._origins[ahead][near].to(key.ray), rho[near].to(key.ray))
+        key.points = _spread(key.ray, self.tracks.origins[ahead][near].to(key.ray), rho[near].to(key.ray))
         T_last = lie.se3(view.R_tgt_ref, t)
         affine = torch.zeros(2, dtype=torch.float64)
         for _ in range(2):

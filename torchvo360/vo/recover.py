@@ -53,6 +53,14 @@ class Recovery:
         self._remembered.append(Remembered(points, self._small(key.frame)))
         self._turn = 0
 
+    def __len__(self) -> int:
+        return len(self._remembered)
+
+    def forget(self, first: int) -> None:
+        """Forget all but the first keyframes, when the later ones' map turned out wrong."""
+        del self._remembered[first:]
+        self._turn = 0
+
     def _small(self, frame: PyramidFrame) -> Target:
         """Return the coarsest level, smoothed further."""
         target = frame.targets[-1]

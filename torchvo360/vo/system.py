@@ -78,6 +78,8 @@ class VisualOdometry:
         self._initialiser = self._new_initialiser()
         self._T_world_ref = torch.eye(4, dtype=torch.float64)
         self._unit = 1.0
+        self._unconfirmed: Initialiser | None = None
+        self._remembered_before = 0
         self._last: PyramidFrame | None = None
         self._lost = 0
 
@@ -163,7 +165,7 @@ class VisualOdometry:
         T_world_cam = self._T_world_ref @ lie.se3(R_cam_ref.mT, R_cam_ref.new_zeros(3))
         return _estimate(frame, T_world_cam, self._waiting, starter.reason, None)
 
-    def _begin_map(self, start: Start, frame: PyramidFrame) -> FrameEstimate:
+    def _begin_map(self, start: Start, frame: PyramidFrame, reason: str = "") -> FrameEstimate:
         """Take over a start: fill in the poses of the frames that waited for it, and go on from the newest."""
         # A new map after a loss takes the old one's unit by its median range.
         start = start.rescaled(self._unit)
@@ -171,9 +173,12 @@ class VisualOdometry:
         follower = Follower(self._builder, self.config, self._recovery, start.key)
         known, found = track_pending(start, self._initialiser.pending, follower, self.config)
         self._estimates = fill_in(self._estimates, start.key, known, self._initialiser.rotations)
-        self._initialiser = self._new_initialiser()
+        # The initialiser goes on following its corners, until they have confirmed the start.
+        self._unconfirmed, self._initialiser = self._initialiser, self._new_initialiser()
+        self._remembered_before = len(self._recovery)
         self._follower, self._lost, self._maps = follower, 0, self._maps + 1
-        state, reason = (State.TRACKING, "ok") if self._maps == 1 else (State.RELOCALISED, "new_map")
+        state = State.TRACKING if self._maps == 1 or reason else State.RELOCALISED
+        reason = reason or ("ok" if self._maps == 1 else "new_map")
         return _estimate(frame, follower.T_world_cam, state, reason, found)
 
     # With a map
@@ -181,7 +186,16 @@ class VisualOdometry:
     def _follow(self, follower: Follower, frame: PyramidFrame) -> FrameEstimate:
         found, T_world_cam = follower.follow(frame, self._last)
         if found is None:
+            self._unconfirmed = None
             return self._lose(follower, frame)
+        if self._unconfirmed is not None:
+            T_cam_start = lie.se3_inverse(T_world_cam) @ self._T_world_ref
+            over, start = self._unconfirmed.check(frame, T_cam_start)
+            checked, self._unconfirmed = self._unconfirmed, None if over else self._unconfirmed
+            if start is not None:
+                self._initialiser = checked
+                self._recovery.forget(self._remembered_before)
+                return self._begin_map(start, frame, "start_corrected")
         was_lost, self._lost = self._lost > 0, 0
         if found.inliers < self.config.weak_inliers:
             return _estimate(frame, T_world_cam, State.WEAK, "low_agreement", found)

@@ -59,7 +59,7 @@ def robust(
         size = residual.abs()
         weight, cost = torch.ones_like(residual), residual * residual * 0.5
     if loss.cutoff is not None:
-        limit = residual.new_tensor([loss.cutoff])
+        limit = residual.new_tensor(loss.cutoff)
         _, most = robust(
             limit, LossConfig(name=loss.name, scale=loss.scale, degrees_of_freedom=loss.degrees_of_freedom)
         )

@@ -20,20 +20,13 @@ def solve_ldl(
         x: The solution; zero where A is not positive definite or not finite.
         ok: Whether it is.
     """
-    diagonal = A.diagonal(dim1=-2, dim2=-1)
-    finite = torch.isfinite(A).flatten(-2).all(-1) & torch.isfinite(b).all(-1) & (diagonal > 0).all(-1)
-    safe_diagonal = torch.where(finite[..., None], diagonal, torch.ones_like(diagonal))
-    scale = safe_diagonal.rsqrt()
-    eye = torch.eye(A.shape[-1], dtype=A.dtype, device=A.device)
-    scaled = torch.where(finite[..., None, None], A * scale[..., None] * scale[..., None, :], eye)
-    factor, pivots, info = torch.linalg.ldl_factor_ex(scaled)
-    # A negative pivot marks a 2 x 2 block of D, which only an indefinite matrix has.
-    ok = finite & (info == 0) & (pivots > 0).all(-1) & (factor.diagonal(dim1=-2, dim2=-1) > PIVOT_TOLERANCE).all(-1)
-    factor = torch.where(ok[..., None, None], factor, eye)
-    pivots = torch.where(ok[..., None], pivots, torch.arange(1, A.shape[-1] + 1, dtype=pivots.dtype, device=A.device))
-    right = torch.where(ok[..., None], b * scale, torch.zeros_like(b))
-    x = torch.linalg.ldl_solve(factor, pivots, right[..., None])[..., 0] * scale
-    return torch.where(ok[..., None], x, torch.zeros_like(x)), ok
+    scale = A.diagonal(dim1=-2, dim2=-1).clamp_min(torch.finfo(A.dtype).tiny).rsqrt()
+    factor, pivots, info = torch.linalg.ldl_factor_ex(A * scale[..., None] * scale[..., None, :])
+    # A negative pivot marks a 2 x 2 block of D, which only an indefinite matrix has; NaN fails every comparison.
+    positive = (factor.diagonal(dim1=-2, dim2=-1) > PIVOT_TOLERANCE) & (pivots > 0)
+    ok = positive.all(-1) & (info == 0) & torch.isfinite(b).all(-1)
+    x = torch.linalg.ldl_solve(factor, pivots, (b * scale)[..., None])[..., 0] * scale
+    return torch.where(ok[..., None], x, 0.0), ok
 
 
 def inverse_ldl(A: Float[Tensor, "*batch D D"]) -> tuple[Float[Tensor, "*batch D D"], Bool[Tensor, "*batch"]]:

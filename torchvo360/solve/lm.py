@@ -1,8 +1,8 @@
 """Batched Levenberg-Marquardt: `(H + lambda diag H) delta = -g`, every element of the batch its own problem.
 
 Each element has its own damping, its own acceptance and its own end; elements that have ended leave the work. One
-linearisation a step: the candidate's serves as the next step's when it is accepted. Costs are compared as means over
-the samples' weights, because samples may leave the view between steps.
+linearisation a step: the candidate's serves as the next step's when it is accepted, and a step below the tolerance is
+taken without one. Costs are compared as means over the samples' weights, because samples may leave the view.
 """
 
 from collections.abc import Callable
@@ -34,7 +34,7 @@ class LMConfig:
     max_damping: float = 1e5
     """A step refused at this damping ends the solve: no step in any direction lowers the cost."""
     step_tolerance: float = 0.01
-    """A shorter accepted step has converged; in the unit of `step_scale`, for alignment in pixels."""
+    """A shorter step is taken and ends the solve; in the unit of `step_scale`, for alignment in pixels."""
     cost_tolerance: float = 1e-5
     """A step that lowers the cost by a smaller share has converged, as has a refused one that promised less."""
 
@@ -88,7 +88,7 @@ class Solution(NamedTuple):
 
     state: State
     equations: NormalEquations
-    """At the solution, undamped, with all parameters."""
+    """At the solution, or a step below the tolerance before it; undamped, with all parameters."""
     status: Int64[Tensor, "B"]
     steps: Int64[Tensor, "B"]
     """Steps tried, accepted or not."""
@@ -134,15 +134,27 @@ def minimize(
     fixed = torch.diag((~free).to(equations.H.dtype))
     both_free = free[:, None] & free
 
-    for _ in range(config.max_steps):
-        if active.numel() == 0:
-            return result
+    while active.numel():
         weight = equations.weight[:, None]
         H = equations.H / weight[..., None] * both_free + fixed
         g = equations.g / weight * free
-        cost = equations.cost / equations.weight
         delta, solvable = solve_ldl(H + torch.diag_embed(damping.value[:, None] * H.diagonal(dim1=-2, dim2=-1)), -g)
         candidate = retract(state, delta)
+        steps = steps + 1
+        # The model is trusted for steps below the tolerance, unless it is the damping that made them short.
+        length = torch.linalg.vector_norm(delta * step_scale[active], dim=-1)
+        arrived = solvable & (length < config.step_tolerance) & (damping.value <= 1)
+        if bool(arrived.any()):
+            outcome = torch.full_like(steps, int(Status.CONVERGED))
+            result = _write(result, active, arrived, candidate, equations, outcome, steps)
+            going = ~arrived
+            active, state, candidate = active[going], _pick(state, going), _pick(candidate, going)
+            equations, damping = NormalEquations(*_pick(equations, going)), Damping(*_pick(damping, going))
+            H, g, delta, solvable, steps = _pick((H, g, delta, solvable, steps), going)
+            if active.numel() == 0:
+                return result
+
+        cost = equations.cost / equations.weight
         proposed = linearize(candidate, active)
         proposed_cost = proposed.cost / proposed.weight.clamp_min(min_weight)
         promised = -(delta * (g + 0.5 * (H @ delta[..., None])[..., 0])).sum(-1)
@@ -150,13 +162,12 @@ def minimize(
         usable = solvable & torch.isfinite(proposed_cost) & (proposed.weight >= min_weight)
         accepted = usable & (gained > 0)
 
-        small = torch.linalg.vector_norm(delta * step_scale[active], dim=-1) < config.step_tolerance
         little = torch.where(accepted, gained, promised) <= config.cost_tolerance * cost
-        converged = solvable & torch.where(accepted, small | little, little & (promised >= 0))
+        converged = solvable & little & (accepted | (promised >= 0))
         singular = ~solvable & (damping.value >= 1)
         stalled = ~accepted & (damping.value >= config.max_damping) & ~converged & ~singular
+        spent = (steps >= config.max_steps) & ~converged & ~singular & ~stalled
 
-        steps = steps + 1
         gain = gained / promised.clamp_min(torch.finfo(promised.dtype).tiny)
         damping = next_damping(config, damping, accepted, gain)
         if bool(accepted.all()):
@@ -165,16 +176,16 @@ def minimize(
             state = tuple(_choose(accepted, new, old) for new, old in zip(candidate, state, strict=True))
             chosen = (_choose(accepted, new, old) for new, old in zip(proposed, equations, strict=True))
             equations = NormalEquations(*chosen)
-        ended = converged | singular | stalled
+        ended = converged | singular | stalled | spent
         if bool(ended.any()):
             outcome = torch.where(converged, int(Status.CONVERGED), int(Status.STALLED))
             outcome = torch.where(singular, int(Status.SINGULAR), outcome)
+            outcome = torch.where(spent, int(Status.MAX_STEPS), outcome)
             result = _write(result, active, ended, state, equations, outcome, steps)
             going = ~ended
             active, state, steps = active[going], _pick(state, going), steps[going]
             equations, damping = NormalEquations(*_pick(equations, going)), Damping(*_pick(damping, going))
-    everything = torch.ones_like(active, dtype=torch.bool)
-    return _write(result, active, everything, state, equations, result.status[active], steps)
+    return result
 
 
 def _pick(parts: tuple[Tensor, ...], index: Tensor) -> tuple[Tensor, ...]:

@@ -69,7 +69,10 @@ def _linearize(
 ) -> _System:
     K, (N, P) = T.shape[0], value.shape
     each = rho.repeat_interleave(P).expand(K, -1)
-    reference = Reference(ray.reshape(1, 3, -1), each, value.reshape(1, 1, -1).expand(K, -1, -1), torch.ones_like(each))
+    flat = value.reshape(1, 1, -1).expand(K, -1, -1)
+    # Beyond the edge of a camera that does not wrap there is no value, and no weight.
+    known = torch.isfinite(flat)
+    reference = Reference(ray.reshape(1, 3, -1), each, flat.nan_to_num(nan=0.0), known[:, 0].to(rho.dtype))
     samples = look_up(reference, targets, T.to(ray.dtype), affine.to(ray.dtype))
     weight, cost = robust(samples.residual, loss)
     weight = weight * samples.weight
@@ -102,7 +105,7 @@ def refine_jointly(
     Args:
         ray: The host's unit rays, P for each point.
         rho: The points' inverse ranges to start from.
-        value: The rays' intensities.
+        value: The rays' intensities; NaN where the host does not see them.
         targets: The K target images.
         T_tgt_ref: Poses to start from; the last one's translation keeps its length.
         affine: (a, b) of each target to start from.

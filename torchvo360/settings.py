@@ -51,8 +51,8 @@ class RunConfig:
     """A TUM file with true poses at the frames' times, in seconds."""
     seed: int = 0
     """Of the odometry's random samples."""
-    threads: int | None = None
-    """Threads to compute with; null leaves the choice to PyTorch and OpenCV."""
+    threads: int | None = 1
+    """Threads to compute with: small operations gain little from more; null leaves it to PyTorch and OpenCV."""
     device: str = "cpu"
     """cpu or cuda."""
     out: str | None = None

@@ -1,4 +1,4 @@
-"""Agreement tells true alignments from false ones, whatever the exposure, and is 0 where there is nothing to tell by."""
+"""Agreement tells true alignments from false ones at any exposure, and is 0 where there is nothing to tell by."""
 
 from dataclasses import replace
 
@@ -46,7 +46,7 @@ def test_true_alignments_agree_and_false_ones_do_not(pairs, noise):
 
 def test_a_gain_that_vanishes_explains_nothing(pairs):
     # A reference without contrast explains almost half of weak gradients: no merit of the alignment.
-    reference, target, affine = problem(pairs)
+    reference, target, _ = problem(pairs)
     mean = target.padded[..., 1:-1, 1:-1].mean((1, 2, 3)).double()
     vanished = torch.stack([torch.full_like(mean, -30.0), mean], -1)
     samples = look_up(reference, target, pairs.T_tgt_ref_true.float(), vanished.float())
@@ -70,9 +70,7 @@ def test_exposure_and_contrast_do_not_count(pairs):
     share = agreeing_share(reference, target, pairs.T_tgt_ref_true, affine)
     darker = replace(target, padded=0.3 * target.padded + 0.1)
     moved = torch.stack([affine[:, 0] + torch.tensor(0.3).log(), 0.3 * affine[:, 1] + 0.1], -1)
-    torch.testing.assert_close(
-        agreeing_share(reference, darker, pairs.T_tgt_ref_true, moved), share, atol=2e-3, rtol=0
-    )
+    torch.testing.assert_close(agreeing_share(reference, darker, pairs.T_tgt_ref_true, moved), share, atol=2e-3, rtol=0)
 
 
 def test_it_is_a_share_and_needs_something_to_see(pairs):

@@ -39,9 +39,10 @@ class AlignConfig:
     """Settings of `align`."""
 
     levels: int = 0
-    """Pyramid levels; 0 takes as many as leave the coarsest at least `coarsest_width` wide."""
+    """Pyramid levels; 0 takes as many as `coarsest_width` asks for."""
     coarsest_width: int = 64
-    """Rotation-only alignment at 64 x 32 pixels converges from 40 deg, at 128 x 64 from 15 (measured)."""
+    """Least width of a panorama's coarsest level: rotation-only alignment at 64 x 32 pixels converges from 40 deg, at
+    128 x 64 from 15 (measured). Other cameras go on to pixels of the same angle, while the level is 16 pixels wide."""
     finest: int = 0
     """Level at which to stop: 0 is the image's own resolution; stopping at half of it is three times less accurate."""
     blur_px: float = 0.5
@@ -75,7 +76,8 @@ class AlignConfig:
         Raises:
             InputError: The finest level is not one of them.
         """
-        count = self.levels or 1 + max(0, math.floor(math.log2(max(1.0, camera.width / self.coarsest_width))))
+        around = min(math.tau / camera.pixel_angle / self.coarsest_width, camera.width / 16)
+        count = self.levels or 1 + math.floor(math.log2(max(1.0, around * (1 + 1e-9))))
         if self.finest >= count:
             raise InputError(f"finest: expected a level below {count}, the number of levels, got {self.finest}.")
         return count
@@ -139,10 +141,7 @@ def _levels(
     ref, ref_finite = _finite(ref)
     tgt, tgt_finite = _finite(tgt)
     known = (
-        (rho >= 0)
-        & (rho <= MAX_RHO)
-        & usable
-        & (ref_finite if bool(ref_finite.all()) else _erode(ref_finite, camera))
+        (rho >= 0) & (rho <= MAX_RHO) & usable & (ref_finite if bool(ref_finite.all()) else _erode(ref_finite, camera))
     )
     confidence = None if bool(tgt_finite.all()) else _erode(tgt_finite, camera).to(tgt.dtype)
     saturation = config.saturation if ref.shape[1] == 1 else None
@@ -163,7 +162,6 @@ def _levels(
         each = level_known * (area / area.mean())
         if weight is not None:
             each = each * weight
-        B = ref.shape[0]
         reference = Reference(
             ray=at.ray_grid(dtype=ref.dtype, device=ref.device).permute(2, 0, 1).reshape(1, 3, -1).contiguous(),
             rho=level_rho.flatten(1).contiguous(),

@@ -133,7 +133,14 @@ def write_all(folder: Path, record: Record) -> dict[str, Any]:
             with atomic_path(folder / "trajectory.png") as temporary:
                 states = [str(frame.state) for frame in result.frames]
                 truth = record.truth if record.evaluation else None
-                plot_trajectory(temporary, result.trajectory, truth=truth, states=states, title=record.name)
+                plot_trajectory(
+                    temporary,
+                    result.trajectory,
+                    truth=truth,
+                    points=result.points,
+                    states=states,
+                    title=record.name,
+                )
         else:
             (folder / "trajectory.png").unlink(missing_ok=True)  # an overwritten run's
         _write_text(folder / "config.yaml", record.config_yaml)

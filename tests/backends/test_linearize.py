@@ -56,14 +56,24 @@ def problem(
     image = texture(camera, B, C, seed=2) + 0.3 * (texture(camera, B, C, seed=5) - 0.5)
     xi = torch.randn(B, 6, generator=generator, dtype=torch.float64) * torch.tensor([0.1] * 3 + [0.05] * 3)
     affine = 0.05 * torch.randn(B, 2, generator=generator, dtype=torch.float64)
-    cast = {k: None if v is None else v.float().to(dtype) for k, v in vars(reference).items()}
-    return Reference(**cast), make_target(image.float().to(dtype), camera), lie.se3_exp(xi), affine  # pyright: ignore[reportArgumentType]
+    target = make_target(image.float().to(dtype), camera)
+    return converted(reference, torch.float32, dtype), target, lie.se3_exp(xi), affine
+
+
+def converted(reference: Reference, *dtypes: torch.dtype) -> Reference:
+    def convert(value: Tensor) -> Tensor:
+        for dtype in dtypes:
+            value = value.to(dtype)
+        return value
+
+    variance = None if reference.variance is None else convert(reference.variance)
+    ray, rho, value, weight = (convert(v) for v in (reference.ray, reference.rho, reference.value, reference.weight))
+    return Reference(ray, rho, value, weight, variance)
 
 
 def in_float64(reference: Reference, target: Target) -> tuple[Reference, Target]:
-    points = Reference(**{k: None if v is None else v.double() for k, v in vars(reference).items()})
     confidence = None if target.confidence is None else target.confidence.double()
-    return points, replace(target, padded=target.padded.double(), confidence=confidence)
+    return converted(reference, torch.float64), replace(target, padded=target.padded.double(), confidence=confidence)
 
 
 def pixel_slopes(camera: Camera, Y: Float[Tensor, "N 3"], rho: Float[Tensor, "N"]) -> Float[Tensor, "N 2 6"]:

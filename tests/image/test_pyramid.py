@@ -1,5 +1,7 @@
 """Levels keep the mean, the sphere and the place of every pixel."""
 
+from itertools import pairwise
+
 import cv2
 import numpy as np
 import pytest
@@ -22,7 +24,7 @@ def test_a_level_is_the_mean_of_four_pixels(camera, batch):
     image = noise(*batch, camera.height, camera.width)
     levels = pyramid(image, camera, 3)
     assert levels[0][1] is image
-    for (_, fine), (small, coarse) in zip(levels, levels[1:], strict=False):
+    for (_, fine), (small, coarse) in pairwise(levels):
         expected = sum(fine[..., i::2, j::2] for i in (0, 1) for j in (0, 1)) / 4
         torch.testing.assert_close(coarse, expected, atol=1e-14, rtol=0)
         assert coarse.shape == (*batch, small.height, small.width)
@@ -69,7 +71,9 @@ def test_blur_equals_opencvs_gaussian_inside(sigma):
 @pytest.mark.parametrize("k", [1, 7, 16])
 def test_blur_and_levels_commute_with_rolling(k):
     image = noise(16, 32)
-    torch.testing.assert_close(blur(image.roll(k, -1), SPHERE, 1.0), blur(image, SPHERE, 1.0).roll(k, -1), atol=1e-14, rtol=0)
+    torch.testing.assert_close(
+        blur(image.roll(k, -1), SPHERE, 1.0), blur(image, SPHERE, 1.0).roll(k, -1), atol=1e-14, rtol=0
+    )
     turned = pyramid(image.roll(2 * k, -1), SPHERE, 2)[1][1]
     torch.testing.assert_close(turned, pyramid(image, SPHERE, 2)[1][1].roll(k, -1), atol=1e-14, rtol=0)
 
@@ -81,7 +85,9 @@ def test_blur_of_an_upside_down_panorama_is_the_upside_down_blur():
     torch.testing.assert_close(turned, blur(image, SPHERE, 1.0).flip(-1, -2), atol=1e-14, rtol=0)
     # A tilt by 180 deg about the right axis goes over both poles: (u, v) -> (u + w / 2 mirrored back, -v).
     over = image.flip(-2).roll(16, -1)
-    torch.testing.assert_close(blur(over, SPHERE, 1.0), blur(image, SPHERE, 1.0).flip(-2).roll(16, -1), atol=1e-14, rtol=0)
+    torch.testing.assert_close(
+        blur(over, SPHERE, 1.0), blur(image, SPHERE, 1.0).flip(-2).roll(16, -1), atol=1e-14, rtol=0
+    )
 
 
 def test_no_blur_leaves_the_image_as_it_is():

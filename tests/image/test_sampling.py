@@ -58,7 +58,10 @@ def bilinear(image: np.ndarray, u: float, v: float, wraps: bool) -> float:
 def test_sample_equals_the_textbook(camera, dtype, points):
     image, uv = noise(2, 3, camera.height, camera.width), pixels(camera, 2, *points)
     expected = [
-        [[bilinear(image[b, c].numpy(), *p, camera.wraps) for p in uv[b].view(-1, 2).tolist()] for c in range(3)]
+        [
+            [bilinear(image[b, c].numpy(), p[0], p[1], camera.wraps) for p in uv[b].view(-1, 2).tolist()]
+            for c in range(3)
+        ]
         for b in range(2)
     ]
     actual = sample(image.to(dtype), uv.to(dtype), camera)

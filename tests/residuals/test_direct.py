@@ -11,7 +11,7 @@ import pytest
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
-from torch.func import jacfwd, vmap
+from torch.func import jacfwd
 
 from torchvo360 import lie
 from torchvo360.cameras import Camera, Equirectangular, Pinhole
@@ -222,7 +222,10 @@ def test_at_the_poles_rows_are_finite_and_bounded():
     for dtype in (torch.float32, torch.float64):
         image = torch.rand(1, 1, 32, 64, generator=torch.Generator().manual_seed(0)).to(dtype)
         reference = Reference(
-            towards.T[None].to(dtype), torch.zeros(1, 4, dtype=dtype), torch.zeros(1, 1, 4, dtype=dtype), torch.ones(1, 4)
+            towards.T[None].to(dtype),
+            torch.zeros(1, 4, dtype=dtype),
+            torch.zeros(1, 1, 4, dtype=dtype),
+            torch.ones(1, 4),
         )
         T, ab = torch.eye(4, dtype=dtype)[None], torch.zeros(1, 2, dtype=dtype)
         samples = look_up(reference, make_target(image, SPHERE), T, ab)
@@ -237,7 +240,10 @@ def test_at_the_poles_rows_are_finite_and_bounded():
 def test_points_out_of_view_weigh_nothing_and_stay_finite(camera, dtype):
     rays = torch.tensor([[0.0, 0.0, 1.0], [0.0, 0.0, -1.0], [0.3, 0.1, -1e-14], [0.0, 0.0, 0.0], [5.0, 0.0, 1.0]])
     reference = Reference(
-        rays.T[None].to(dtype), torch.full((1, 5), 2.0, dtype=dtype), torch.zeros(1, 1, 5, dtype=dtype), torch.ones(1, 5)
+        rays.T[None].to(dtype),
+        torch.full((1, 5), 2.0, dtype=dtype),
+        torch.zeros(1, 1, 5, dtype=dtype),
+        torch.ones(1, 5),
     )
     image = torch.rand(1, 1, camera.height, camera.width, generator=torch.Generator().manual_seed(0)).to(dtype)
     T, ab = torch.eye(4, dtype=dtype)[None], torch.zeros(1, 2, dtype=dtype)
@@ -271,7 +277,9 @@ def test_confidence_and_saturation_take_weight_away(batch):
 
 @CAMERAS
 def test_look_up_value_shows_the_image_and_nan_where_it_is_not_seen(camera):
-    image = torch.rand(1, 1, camera.height, camera.width, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    image = torch.rand(
+        1, 1, camera.height, camera.width, generator=torch.Generator().manual_seed(0), dtype=torch.float64
+    )
     target = make_target(image, camera)
     rays = camera.ray_grid(dtype=torch.float64).permute(2, 0, 1)
     torch.testing.assert_close(look_up_value(target, rays), image[0, 0], atol=1e-9, rtol=0)

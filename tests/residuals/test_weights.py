@@ -25,7 +25,9 @@ LOSSES = pytest.mark.parametrize(
 
 
 def residuals(dtype: torch.dtype = torch.float64) -> torch.Tensor:
-    return torch.cat([torch.linspace(-1, 1, 401, dtype=dtype) + 1e-4, torch.tensor([1e-9, -1e-9, 5.0, -80.0], dtype=dtype)])
+    return torch.cat(
+        [torch.linspace(-1, 1, 401, dtype=dtype) + 1e-4, torch.tensor([1e-9, -1e-9, 5.0, -80.0], dtype=dtype)]
+    )
 
 
 @LOSSES
@@ -89,7 +91,9 @@ def test_values_of_the_papers_formulas():
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64], ids=str)
-@pytest.mark.parametrize("loss", [LossConfig(), LossConfig(name="student_t"), LossConfig(name="none")], ids=lambda x: x.name)
+@pytest.mark.parametrize(
+    "loss", [LossConfig(), LossConfig(name="student_t"), LossConfig(name="none")], ids=lambda x: x.name
+)
 def test_gradients_are_finite_at_zero(loss, dtype):
     r = torch.tensor([0.0, 1e-30, -1e-30], dtype=dtype, requires_grad=True)
     weight, cost = robust(r, loss)

@@ -15,7 +15,11 @@ from torchvo360.solve import LMConfig, Solution, Status, minimize
 from torchvo360.solve.lm import Damping, initial_damping, next_damping
 
 BOTH = pytest.mark.parametrize("damping", ["gain_ratio", "lsd"])
-PRECISE = {"step_tolerance": 1e-9, "cost_tolerance": 1e-14}
+
+
+def precise(damping: str = "gain_ratio", max_steps: int = 30) -> LMConfig:
+    """Tolerances that let a solve go on to the last digits."""
+    return LMConfig(damping=damping, max_steps=max_steps, step_tolerance=1e-9, cost_tolerance=1e-14)
 
 
 @dataclass
@@ -76,11 +80,11 @@ def test_a_quadratic_is_solved_in_one_step():
     problem = Problem(lambda x, k: A.index_select(0, k[None])[0] @ x - b.index_select(0, k[None])[0])
     expected = torch.linalg.lstsq(A, b[..., None]).solution[..., 0]
     # The lsd schedule starts undamped: its first step is Gauss-Newton's.
-    solution = problem.solve(torch.zeros(4, 3, dtype=torch.float64), LMConfig(damping="lsd", **PRECISE))
+    solution = problem.solve(torch.zeros(4, 3, dtype=torch.float64), precise(damping="lsd"))
     torch.testing.assert_close(problem.asked[1][0], expected, atol=1e-9, rtol=0)
     assert status(solution) == ["CONVERGED"] * 4
     assert (solution.steps <= 3).all()
-    damped = problem.solve(torch.zeros(4, 3, dtype=torch.float64), LMConfig(**PRECISE))
+    damped = problem.solve(torch.zeros(4, 3, dtype=torch.float64), precise())
     torch.testing.assert_close(damped.state[0], expected, atol=1e-6, rtol=0)
     assert status(damped) == ["CONVERGED"] * 4
 
@@ -89,7 +93,7 @@ def test_a_quadratic_is_solved_in_one_step():
 def test_a_curved_valley_is_followed_to_its_end(damping):
     problem = Problem(rosenbrock)
     solution = problem.solve(
-        starts((-1.2, 1.0), (3.0, -2.0), (0.0, 0.0), (-3.0, 5.0)), LMConfig(damping=damping, max_steps=1000, **PRECISE)
+        starts((-1.2, 1.0), (3.0, -2.0), (0.0, 0.0), (-3.0, 5.0)), precise(damping=damping, max_steps=1000)
     )
     assert status(solution) == ["CONVERGED"] * 4
     torch.testing.assert_close(solution.state[0], torch.ones(4, 2, dtype=torch.float64), atol=1e-5, rtol=0)
@@ -98,7 +102,7 @@ def test_a_curved_valley_is_followed_to_its_end(damping):
 @BOTH
 def test_curves_are_fitted_to_a_stationary_point(damping):
     problem = Problem(curve_fit)
-    solution = problem.solve(torch.ones(5, 3, dtype=torch.float64), LMConfig(damping=damping, max_steps=100, **PRECISE))
+    solution = problem.solve(torch.ones(5, 3, dtype=torch.float64), precise(damping=damping, max_steps=100))
     assert status(solution) == ["CONVERGED"] * 5
     assert solution.equations.g.abs().max() < 1e-6
     expected = starts(*((2.0, 0.5 + 0.2 * k, 0.3) for k in range(5)))
@@ -111,7 +115,7 @@ def test_a_batch_equals_its_elements_solved_alone(damping, residual):
     D = 2 if residual is rosenbrock else 3
     start = 1 + torch.randn(6, D, generator=torch.Generator().manual_seed(2), dtype=torch.float64)
     start[0] = 1.0  # which ends at once, or later than the others
-    config = LMConfig(damping=damping, max_steps=60, **PRECISE)
+    config = precise(damping=damping, max_steps=60)
     together = Problem(residual).solve(start, config)
     assert len(set(together.steps.tolist())) > 1
     for k in range(6):
@@ -124,7 +128,7 @@ def test_a_batch_equals_its_elements_solved_alone(damping, residual):
 
 def test_elements_that_have_ended_leave_the_work():
     problem = Problem(rosenbrock)
-    solution = problem.solve(starts((1.0, 1.0), (-1.2, 1.0), (3.0, -2.0)), LMConfig(max_steps=200, **PRECISE))
+    solution = problem.solve(starts((1.0, 1.0), (-1.2, 1.0), (3.0, -2.0)), precise(max_steps=200))
     sizes = [len(index) for _, index in problem.asked]
     assert sizes == sorted(sizes, reverse=True)
     assert sizes[-1] < 3
@@ -141,7 +145,7 @@ def test_a_start_at_an_exact_minimum_has_converged():
 
 def test_parameters_that_are_not_free_stay():
     start = starts((1.5, 1.0, 0.3), (2.5, 0.4, 0.1))
-    solution = Problem(curve_fit).solve(start, LMConfig(max_steps=100, **PRECISE), free=[True, True, False])
+    solution = Problem(curve_fit).solve(start, precise(max_steps=100), free=[True, True, False])
     assert torch.equal(solution.state[0][:, 2], start[:, 2])
     assert status(solution) == ["CONVERGED"] * 2
     assert solution.equations.g[:, :2].abs().max() < 1e-6
@@ -197,7 +201,7 @@ def test_a_wrong_slope_stalls(damping):
 def test_what_is_not_determined_is_singular(damping):
     problem = Problem(lambda x, k: torch.stack([x[0] + x[1] - 1, 2 * (x[0] + x[1]) + k]) * torch.where(k == 1, 1.0, 0.0)
                       + torch.where(k == 1, 0.0, 1.0) * torch.stack([x[0] - 1, x[1] ** 3 - 8]))  # fmt: skip
-    solution = problem.solve(starts((3.0, 1.5), (3.0, 1.5), (0.0, 1.0)), LMConfig(damping=damping, max_steps=60, **PRECISE))
+    solution = problem.solve(starts((3.0, 1.5), (3.0, 1.5), (0.0, 1.0)), precise(damping=damping, max_steps=60))
     # Damping makes a singular H solvable along what is determined; a parameter without any slope stays singular.
     assert status(solution)[0] == status(solution)[2] == "CONVERGED"
     torch.testing.assert_close(solution.state[0][[0, 2]], starts((1.0, 2.0), (1.0, 2.0)), atol=1e-6, rtol=0)
@@ -213,7 +217,7 @@ def test_too_little_weight_and_a_cost_that_is_not_finite_end_at_once():
 
     problem = Problem(residual)
     start = starts((-1.2, 1.0), (-1.2, 1.0), (3.0, 1.0))
-    solution = problem.solve(start, LMConfig(max_steps=300, **PRECISE))
+    solution = problem.solve(start, precise(max_steps=300))
     assert status(solution) == ["CONVERGED", "DIVERGED", "CONVERGED"]
     assert torch.equal(solution.state[0][1], start[1])
     assert solution.steps[1] == 0
@@ -227,7 +231,7 @@ def test_too_little_weight_and_a_cost_that_is_not_finite_end_at_once():
 def test_steps_into_what_is_not_finite_or_out_of_view_are_refused(damping):
     # Beyond x = 0 nothing is finite; the full step from 1 would land there.
     problem = Problem(lambda x, k: torch.stack([torch.log(x[0]) + 2.0, 1e-3 * x[0]]))
-    solution = problem.solve(starts((1.0,)), LMConfig(damping=damping, max_steps=100, **PRECISE))
+    solution = problem.solve(starts((1.0,)), precise(damping=damping, max_steps=100))
     assert status(solution) == ["CONVERGED"]
     torch.testing.assert_close(solution.state[0], starts((0.13533,)), atol=1e-4, rtol=0)
 
@@ -274,7 +278,7 @@ def test_each_element_has_its_own_damping():
         return torch.where(k == 0, torch.atan(5 * x), x - 7)
 
     together = Problem(residual)
-    solution = together.solve(starts((3.0,), (0.0,)), LMConfig(damping="lsd", max_steps=100, **PRECISE))
+    solution = together.solve(starts((3.0,), (0.0,)), precise(damping="lsd", max_steps=100))
     assert status(solution) == ["CONVERGED"] * 2
     torch.testing.assert_close(together.asked[1][0][1], torch.tensor([7.0], dtype=torch.float64))
     assert solution.steps[0] > 3
@@ -293,5 +297,7 @@ def test_bad_settings_are_named():
     with pytest.raises(InputError, match=r"^damping: expected one of gain_ratio, lsd, got 'fixed'\.$"):
         LMConfig(damping="fixed")
     for name in ("initial_damping", "max_damping", "step_tolerance", "cost_tolerance"):
+        config = LMConfig()
+        setattr(config, name, -1)
         with pytest.raises(InputError, match=rf"^{name}: expected a finite number above 0, got -1\.$"):
-            LMConfig(**{name: -1})
+            config.__post_init__()

@@ -72,10 +72,10 @@ def _gram(S: Float[Tensor, "B 9 M"]) -> Float64[Tensor, "B 9 9"]:
     blocks = S.shape[2] // SUM_SAMPLES
     rest = S[..., blocks * SUM_SAMPLES :]
     total = torch.bmm(rest, rest.mT).double()
-    if blocks:
+    if blocks and len(S):
         # Element by element: the blocks of one are a view, those of all would be a copy.
         whole = S[..., : blocks * SUM_SAMPLES].unflatten(2, (blocks, SUM_SAMPLES)).transpose(1, 2)
-        total = total + torch.stack([torch.bmm(part, part.mT).double().sum(0) for part in whole])
+        total = total + torch.stack([torch.bmm(part, part.mT).sum(0, dtype=torch.float64) for part in whole])
     return total
 
 

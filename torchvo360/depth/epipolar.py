@@ -124,7 +124,7 @@ def search_great_circles(
         config: Settings.
     """
     step = target.camera.pixel_angle
-    T, affine = T_tgt_ref.to(ray.dtype), affine.to(ray.dtype)
+    T, affine = T_tgt_ref.to(ray), affine.to(ray)
     circles = _great_circles(ray, T)
     samples = _reference_samples(reference, ray, circles, T, step)
     samples = samples * affine[0].exp() + affine[1]

@@ -1,4 +1,4 @@
-"""The trajectory as a picture: from above, and its height over time."""
+"""The trajectory as a picture: from above, over the map, and its height over time."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -10,14 +10,17 @@ import torch
 from jaxtyping import Float64
 from torch import Tensor
 
-from torchvo360.checks import InputError
+from torchvo360.checks import InputError, check_shape
 from torchvo360.data.registration import associate, similarity_between
 from torchvo360.data.trajectory import Trajectory
 from torchvo360.lie import se3_inverse
+from torchvo360.viz.plan import Plan, level_with_path
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
+
+    from torchvo360.vo import PointCloud
 
 STATE_COLOURS = {
     "tracking": "#0072B2",
@@ -28,7 +31,7 @@ STATE_COLOURS = {
 }
 """Told apart in every common form of colour blindness. Source: Okabe and Ito, Color Universal Design."""
 
-OTHER_COLOUR, TRUTH_COLOUR, INK, GRID = "#000000", "#B3B3B3", "#333333", "#E6E6E6"
+OTHER_COLOUR, TRUTH_COLOUR, MAP_COLOUR, INK, GRID = "#000000", "#B3B3B3", "#8C7B6B", "#333333", "#E6E6E6"
 
 LEAST_HEIGHT_SHARE = 0.1
 """The height panel spans at least this share of the extent seen from above, so that noise does not fill it."""
@@ -51,10 +54,11 @@ def plot_trajectory(
     estimate: Trajectory,
     *,
     truth: Trajectory | None = None,
+    points: "PointCloud | None" = None,
     states: Sequence[str] | None = None,
     title: str = "",
 ) -> None:
-    """Draw a trajectory from above and its height over time, as PNG or in the format of the suffix.
+    """Draw a trajectory from above, over the map, and its height over time, as PNG or in the format of the suffix.
 
     Without truth the axes are those of the first camera, in the units of the estimate. With truth the estimate is drawn
     in the true world, after the similarity that fits it best, and the world's axis nearest to the cameras' mean upward
@@ -64,29 +68,41 @@ def plot_trajectory(
         path: The file to write.
         estimate: Poses T_world_cam.
         truth: True poses, metres.
+        points: The map in the world of the estimate; those at about the height of the path are drawn.
         states: One word a pose, which chooses its colour.
         title: Written above.
 
     Raises:
         ModuleNotFoundError: matplotlib is missing; the extra `viz` brings it.
         InputError: There are no poses, the number of states is another, or fewer than three poses have a true one.
+        ShapeError: The points are not [N, 3], or have another number of colours.
     """
     if not len(estimate):
         raise InputError("estimate: expected at least one pose, got none.")
     if states is not None and len(states) != len(estimate):
         raise InputError(f"states: expected one for each of the {len(estimate)} poses, got {len(states)}.")
     if truth is None:
-        drawn, view = se3_inverse(estimate.T_world_cam[:1]) @ estimate.T_world_cam, _first_camera_view()
+        T_drawn_world, view = se3_inverse(estimate.T_world_cam[0]), _first_camera_view()
     else:
         i_estimate, i_truth = associate(estimate, truth)
-        S = similarity_between(estimate.T_world_cam[i_estimate], truth.T_world_cam[i_truth])
-        drawn, view = S @ estimate.T_world_cam, _upright_view(truth)
-    xyz = view(drawn[:, :3, 3])
+        T_drawn_world = similarity_between(estimate.T_world_cam[i_estimate], truth.T_world_cam[i_truth])
+        view = _upright_view(truth)
+    xyz = view((T_drawn_world @ estimate.T_world_cam)[:, :3, 3])
+    plan = None
+    if points is not None:
+        check_shape("points.xyz", points.xyz, "N 3")
+        check_shape("points.rgb", points.rgb, f"{len(points.xyz)} 3")
+        p_drawn = points.xyz.double() @ T_drawn_world[:3, :3].mT + T_drawn_world[:3, 3]
+        plan = level_with_path(view(p_drawn), points.rgb.numpy(), xyz)
     first_ns = estimate.t_ns[0]
     seconds = (estimate.t_ns - first_ns).numpy() / 1e9
     true_xyz = None if truth is None else view(truth.positions)
 
-    page = _page(xyz if true_xyz is None else np.concatenate([xyz, true_xyz]), view, title)
+    seen = xyz if true_xyz is None else np.concatenate([xyz, true_xyz])
+    page = _page(seen, plan, view, title)
+    if plan is not None:
+        halo = xyz if true_xyz is None else true_xyz
+        page.above.plot(halo[:, 0], halo[:, 1], color="white", linewidth=4 if truth is None else 7, zorder=0.8)
     if truth is not None and true_xyz is not None:
         style = {"color": TRUTH_COLOUR, "linewidth": 4.5, "solid_capstyle": "round", "zorder": 1}
         page.above.plot(true_xyz[:, 0], true_xyz[:, 1], label="truth", **style)
@@ -96,6 +112,8 @@ def plot_trajectory(
     for marker, size, row, name in (("o", 9, 0, "start"), ("s", 7, -1, "end")):
         style = {"color": "white", "markeredgecolor": INK, "markeredgewidth": 1.6, "markersize": size, "zorder": 9}
         page.above.plot(xyz[row, 0], xyz[row, 1], marker, label=name, **style)
+    if plan is not None:
+        page.above.plot([], [], "o", color=MAP_COLOUR, markersize=3, label="map at eye level")
     handles, labels = page.above.get_legend_handles_labels()
     page.legend.legend(handles, labels, loc="upper left", frameon=False, fontsize=10, labelcolor=INK, labelspacing=0.7)
     page.figure.savefig(path, dpi=150, facecolor="white")
@@ -129,7 +147,7 @@ class Page:
     legend: "Axes"
 
 
-def _page(xyz: np.ndarray, view: View, title: str) -> Page:
+def _page(xyz: np.ndarray, plan: Plan | None, view: View, title: str) -> Page:
     """Lay out the panels: the height is beside the view from above where that is long upwards, else below it."""
     try:
         from matplotlib.figure import Figure  # not pyplot: no global state, no display needed
@@ -137,6 +155,8 @@ def _page(xyz: np.ndarray, view: View, title: str) -> Page:
     except ModuleNotFoundError as error:
         raise ModuleNotFoundError("plots: expected matplotlib, which `pip install torchvo360[viz]` brings.") from error
     extent = np.ptp(xyz, axis=0)
+    if plan is not None:
+        extent[:2] = np.ptp(np.concatenate([xyz[:, :2], plan.box]), axis=0)
     figure = Figure(figsize=(9, 7), layout=ConstrainedLayoutEngine(w_pad=0.12, h_pad=0.12))
     if extent[1] > 1.3 * extent[0]:
         grid = figure.add_gridspec(2, 2, width_ratios=[1, 1], height_ratios=[1, 1])
@@ -156,6 +176,9 @@ def _page(xyz: np.ndarray, view: View, title: str) -> Page:
         axes.yaxis.label.set_color(INK)
         axes.margins(0.06)
     above.set_aspect("equal", adjustable="datalim")
+    if plan is not None:
+        above.scatter(*plan.xy.T, s=plan.dot_area, c=plan.rgb, linewidths=0, zorder=0.6, rasterized=True)
+        above.dataLim.set_points(plan.box)  # what is drawn later widens it, far points do not
     above.set(xlabel=view.labels[0], ylabel=view.labels[1])
     height.set(xlabel="time (s)", ylabel=view.labels[2])
     span = max(extent[2] * 1.12, LEAST_HEIGHT_SHARE * extent[:2].max(), 1e-9)

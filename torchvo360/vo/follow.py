@@ -40,6 +40,9 @@ class Follower:
     """T_cam_last of the last two frames."""
     age: int = 0
     """Frames since the keyframe."""
+    placed: PyramidFrame | None = None
+    """The last frame that was found, and `T_placed_key` where: frames lost or unusable since do not count."""
+    T_placed_key: Float64[Tensor, "4 4"] = field(default_factory=_identity)
     clouds: list[PointCloud] = field(default_factory=list)
     """Of the keyframes that were left behind."""
 
@@ -56,12 +59,12 @@ class Follower:
         """Stop where the camera is, so that the error of a lost frame cannot run away."""
         self.motion = _identity()
 
-    def follow(self, frame: PyramidFrame, last: PyramidFrame | None) -> tuple[Track | None, Float64[Tensor, "4 4"]]:
-        """Find a frame, fuse it, and make it a keyframe where that is due.
+    def place(self, frame: PyramidFrame) -> None:
+        """Remember where a frame was found: the present pose."""
+        self.placed, self.T_placed_key = frame, self.T_cam_key
 
-        Args:
-            frame: The frame.
-            last: The frame before it, for its rotation.
+    def follow(self, frame: PyramidFrame) -> tuple[Track | None, Float64[Tensor, "4 4"]]:
+        """Find a frame, fuse it, and make it a keyframe where that is due.
 
         Returns:
             The track, None where the frame is lost, and T_world_cam.
@@ -73,7 +76,7 @@ class Follower:
         limit = config.map.max_relative_variance
         found = track(self.key, frame, hypotheses, self.affine, config.track, limit)
         if found is None or found.inliers < config.weak_inliers:
-            found = self.recovery.search(self.key, frame, last, before, self.affine, found)
+            found = self.recovery.search(self.key, frame, self.placed, self.T_placed_key, self.affine, found)
         if found is None or found.inliers < config.lost_inliers:
             return None, self.T_world_cam
         self.motion = lie.se3_normalized(found.T_cam_key @ lie.se3_inverse(before))
@@ -84,6 +87,7 @@ class Follower:
             self.fuse(frame, found)
         if self._keyframe_due(found):
             self._new_keyframe(frame, found)
+        self.place(frame)
         return found, T_world_cam
 
     def fuse(self, frame: PyramidFrame, found: Track) -> None:

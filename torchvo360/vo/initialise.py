@@ -117,9 +117,8 @@ class Initialiser:
             return None
         view = self._view()
         start = None if view is None else self._start(view)
-        if start is None and len(self.pending) > self.config.max_pending:
-            # The newest stays: the corners are in it.
-            self.pending = self.pending[::2] + ([] if len(self.pending) % 2 else self.pending[-1:])
+        if start is None:
+            self._let_go()
         return start
 
     def check(self, frame: PyramidFrame, T_cam_key: Float64[Tensor, "4 4"]) -> tuple[bool, Start | None]:
@@ -140,11 +139,13 @@ class Initialiser:
         if not self._follow(frame):
             return True, None
         if self.tracks.moved() < 0.3 * gate:
+            self._let_go()
             return False, None
         view = self.tracks.two_view(self.generator)
         if view is None or float(view.inlier.double().mean()) < self.config.min_inliers:
             return True, None
         if view.parallax < gate:
+            self._let_go()
             return False, None
         t = T_cam_key[:3, 3]
         cosine = float((view.t_tgt_ref * t).sum() / torch.linalg.vector_norm(t).clamp_min(1e-12))
@@ -161,6 +162,11 @@ class Initialiser:
         self.rotations[frame.index] = self.tracks.rotation(self.rotations[self.pending[-1].index])
         self.pending.append(frame)
         return True
+
+    def _let_go(self) -> None:
+        """Let every second of too many waiting frames go; the newest stays: the corners are in it."""
+        if len(self.pending) > self.config.max_pending:
+            self.pending = self.pending[::2] + ([] if len(self.pending) % 2 else self.pending[-1:])
 
     def _view(self) -> TwoView | None:
         """Return the motion of the newest frame if it can be trusted with a start; else `reason` says why not."""
@@ -257,8 +263,10 @@ class Initialiser:
             variance=variance[usable].expand(K, -1),
         )
         targets = _together([frame.targets[level] for frame in frames])
-        solution = solve_level(reference, targets, T, affine, self.track.align_config(True), max_steps=20)
-        T, affine = solution.state
+        device = key.ray.device
+        settings = self.track.align_config(coarsest=True)
+        solution = solve_level(reference, targets, T.to(device), affine.to(device), settings, max_steps=20)
+        T, affine = (part.to(T.device) for part in solution.state)
         # The newest keeps the essential matrix's baseline, which is the unit.
         length = torch.linalg.vector_norm(T_last[:3, 3]) / torch.linalg.vector_norm(T[-1, :3, 3]).clamp_min(1e-9)
         T[-1, :3, 3] *= length

@@ -63,7 +63,7 @@ class KeyPoints:
 
     def moved(self, T_cam_key: Float64[Tensor, "4 4"]) -> tuple[Float[Tensor, "3 N"], Float[Tensor, "N"]]:
         """Return the points in another camera: unit rays and inverse distances."""
-        T = T_cam_key.to(self.ray.dtype)
+        T = T_cam_key.to(self.ray)
         Y = T[:3, :3] @ self.ray + self.points.rho * T[:3, 3:]
         inv_length = Y.square().sum(0).clamp_min(1e-24).rsqrt()
         return Y * inv_length, self.points.rho * inv_length
@@ -74,7 +74,7 @@ class KeyPoints:
         if not bool(used.any()):
             return 0.0
         moved, _ = self.moved(T_cam_key)
-        turned = T_cam_key[:3, :3].to(self.ray.dtype) @ self.ray
+        turned = T_cam_key[:3, :3].to(self.ray) @ self.ray
         cross = torch.linalg.cross(turned, moved, dim=0).square().sum(0).sqrt()
         return float(torch.atan2(cross, (turned * moved).sum(0))[used].median())
 

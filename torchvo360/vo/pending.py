@@ -46,6 +46,7 @@ def track_pending(
             follower.motion = lie.se3_exp(xi)
             previous, before = known[frame.index], frame.index
     follower.T_cam_key = previous
+    follower.place(next(frame for frame in pending if frame.index == before))
     follower.affine = start.affine if found is None else found.affine
     return known, found
 

@@ -88,7 +88,7 @@ class Recovery:
         Args:
             key: The keyframe.
             frame: The frame to be placed.
-            last: The frame before it.
+            last: The last frame that was found.
             T_last_key: Where that stood.
             affine: Brightness to start from.
             found: What was found so far.

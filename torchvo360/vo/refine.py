@@ -113,7 +113,7 @@ def refine_jointly(
         max_steps: Most steps, refused ones included.
     """
     K = T_tgt_ref.shape[0]
-    T, ab, damping, prior_rho = T_tgt_ref, affine, 1e-2, rho.double()
+    T, ab, damping, prior_rho = T_tgt_ref.to(ray.device), affine.to(ray.device), 1e-2, rho.double()
     length = torch.linalg.vector_norm(T[-1, :3, 3])
     system = _linearize(ray, rho, value, targets, T, ab, loss)
     coupling = COUPLING * system.H_rho.mean()
@@ -156,4 +156,4 @@ def refine_jointly(
             damping *= 8
             if damping > 1e4:
                 break
-    return JointState(T, ab, rho, system.H_rho.to(rho.dtype), cost)
+    return JointState(T.to(T_tgt_ref.device), ab.to(affine.device), rho, system.H_rho.to(rho.dtype), cost)

@@ -35,7 +35,7 @@ class FrameEstimate:
     residual: float
     """Mean absolute residual of the used points, intensities of [0, 1]; NaN where there was none."""
     inliers: float
-    """Share of the points' gradient that is matched to within half a pixel, 0 to 1; NaN where there was none."""
+    """Share of the gradient that is matched to within half a pixel, beyond chance, 0 to 1; NaN where there was none."""
     a: float
     """Log gain of the frame against its keyframe."""
     b: float

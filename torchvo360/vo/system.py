@@ -80,7 +80,6 @@ class VisualOdometry:
         self._unit = 1.0
         self._unconfirmed: Initialiser | None = None
         self._remembered_before = 0
-        self._last: PyramidFrame | None = None
         self._lost = 0
 
     def step(self, frame: Frame) -> FrameEstimate:
@@ -99,7 +98,6 @@ class VisualOdometry:
             ready = self._builder.build(frame.image, frame.index, frame.t_ns)
             follower = self._follower
             estimate = self._initialise(ready) if follower is None else self._follow(follower, ready)
-            self._last = ready
         estimate = replace(estimate, milliseconds=1e3 * (time.perf_counter() - began))
         self._estimates.append(estimate)
         return estimate
@@ -184,7 +182,7 @@ class VisualOdometry:
     # With a map
 
     def _follow(self, follower: Follower, frame: PyramidFrame) -> FrameEstimate:
-        found, T_world_cam = follower.follow(frame, self._last)
+        found, T_world_cam = follower.follow(frame)
         if found is None:
             self._unconfirmed = None
             return self._lose(follower, frame)
@@ -237,7 +235,7 @@ class VisualOdometry:
         if self._follower is not None:
             self._retire(self._follower)
         key = carried_keyframe(old, frame, found, self._builder, self.config)
-        self._follower, self._lost = Follower(self._builder, self.config, self._recovery, key), 0
+        self._follower, self._lost = Follower(self._builder, self.config, self._recovery, key, placed=frame), 0
         self._initialiser = self._new_initialiser()
         return _estimate(frame, key.T_world_key, State.RELOCALISED, "earlier_keyframe", found)
 

@@ -60,7 +60,7 @@ def main() -> None:
             odometry.step(frame)
         result = odometry.finish()
     shown = int(FRAME_SHOWN * len(result.frames))
-    (frame,) = open_images(arguments.video, camera_fit="stretch", start=shown, stop=shown + 1)
+    frame = next(iter(open_images(arguments.video, camera_fit="stretch", start=shown)))
     if frame.image is None:
         raise SystemExit(f"frame {shown} of {arguments.video} cannot be read")
     draw(arguments.output, frame.image, shown, result)

@@ -144,11 +144,16 @@ def test_floor_and_ceiling_do_not_cover_the_walls(tmp_path, walls):
 
 def test_without_points_the_picture_is_that_of_the_path_alone(tmp_path):
     none = PointCloud(torch.zeros(0, 3), torch.zeros(0, 3, dtype=torch.uint8))
-    not_finite = PointCloud(torch.full((3, 3), math.nan), torch.zeros(3, 3, dtype=torch.uint8))
-    for name, points in (("path.png", None), ("none.png", none), ("nan.png", not_finite)):
+    for name, points in (("path.png", None), ("none.png", none)):
         plot_trajectory(tmp_path / name, circle(), points=points)
     assert (tmp_path / "none.png").read_bytes() == (tmp_path / "path.png").read_bytes()
-    assert (tmp_path / "nan.png").read_bytes() == (tmp_path / "path.png").read_bytes()
+
+
+def test_points_that_are_not_finite_are_left_out(tmp_path, walls):
+    bad = PointCloud(torch.tensor([[math.nan] * 3, [math.inf, 0, 0]]), torch.zeros(2, 3, dtype=torch.uint8))
+    for name, points in (("walls.png", walls), ("bad.png", joined(bad, walls))):
+        plot_trajectory(tmp_path / name, circle(), points=points)
+    assert (tmp_path / "bad.png").read_bytes() == (tmp_path / "walls.png").read_bytes()
 
 
 @pytest.mark.parametrize("axis", [0, 1, 2])

@@ -15,7 +15,7 @@ from torchvo360.vo.keyframe import Keyframe, KeyPoints
 from torchvo360.vo.track import Track, TrackConfig, track
 
 GRID_STEP_RAD = 0.43
-"""Spacing of the global search, about a thousand rotations: none is farther than 16 deg from one of them."""
+"""Spacing of the global search, about a thousand rotations: none is farther than 20 deg from one of them."""
 BLUR_PX = 1.0
 """Smoothing of the small images: it widens the basin of the refinement."""
 KEPT = 3

@@ -354,7 +354,7 @@ def test_the_covariance_matches_the_errors_of_noisy_pairs():
     spread = torch.cov(torch.cat([xi, result.a[:, None], result.b[:, None]], -1).T)
     predicted = covariance.mean(0)
     # Bilinear look-up averages neighbouring pixels: it lowers the noise of residuals and makes them depend on each
-    # other, so that the true spread is up to twice the predicted one; 64 draws know it to within 20 %.
+    # other. Measured 0.9 to 1.2 here and, with blur, up to 1.7; 64 draws know a deviation to within 20 %.
     ratio = (spread.diagonal() / predicted.diagonal()).sqrt()
     assert ratio.min() > 0.7
     assert ratio.max() < 2.0

@@ -35,6 +35,11 @@ def walk() -> Recording:
     return Recording(frames=40, seed=1)
 
 
+@pytest.fixture(scope="module")
+def sharp() -> Recording:
+    return Recording(frames=30, seed=1, width=512, height=256)
+
+
 def initialiser(recording: Recording, seed: int = 0, **settings) -> Initialiser:
     config = OdometryConfig()
     builder = FrameBuilder(recording.sequence.camera, 3, config.blur_px, None, config.saturation)
@@ -159,29 +164,29 @@ def test_a_check_that_waits_keeps_a_bounded_number_of_frames(walk):
     assert len(starter.pending) <= 11
 
 
-def test_a_right_start_is_confirmed_once(walk):
-    starter = initialiser(walk)
-    reasons, start = feed(starter, walk.frames)
+def test_a_right_start_is_confirmed_once(sharp):
+    starter = initialiser(sharp)
+    reasons, start = feed(starter, sharp.frames)
     assert start is not None
     answers = []
-    for frame in walk.frames[len(reasons) :]:
+    for frame in sharp.frames[len(reasons) :]:
         assert frame.image is not None
         ready = starter.builder.build(frame.image, frame.index, frame.t_ns)
-        answers.append(starter.check(ready, walk.T_cam_first(frame.index)))
+        answers.append(starter.check(ready, sharp.T_cam_first(frame.index)))
         if answers[-1][0]:
             break
     assert answers[-1][0]
     assert all(new is None for _, new in answers)
 
 
-def test_a_start_that_disagrees_with_the_corners_is_replaced(walk):
-    starter = initialiser(walk)
-    reasons, start = feed(starter, walk.frames)
+def test_a_start_that_disagrees_with_the_corners_is_replaced(sharp):
+    starter = initialiser(sharp)
+    reasons, start = feed(starter, sharp.frames)
     assert start is not None
     wrong = lie.so3_exp(torch.tensor([0.0, math.radians(20), 0.0], dtype=torch.float64))
-    for frame in walk.frames[len(reasons) :]:
+    for frame in sharp.frames[len(reasons) :]:
         assert frame.image is not None
-        T = walk.T_cam_first(frame.index)
+        T = sharp.T_cam_first(frame.index)
         T[:3, 3] = wrong @ T[:3, 3]
         over, new = starter.check(starter.builder.build(frame.image, frame.index, frame.t_ns), T)
         if over:
@@ -190,10 +195,10 @@ def test_a_start_that_disagrees_with_the_corners_is_replaced(walk):
         pytest.fail("the check never ended")
     assert new is not None
     newest = max(new.T_cam_key)
-    assert direction_deg(new.T_cam_key[newest][:3, 3], walk.T_cam_first(newest)[:3, 3]) < 1.5
+    assert direction_deg(new.T_cam_key[newest][:3, 3], sharp.T_cam_first(newest)[:3, 3]) < 1.5
 
 
-def test_the_odometry_corrects_a_wrong_start_and_rewrites_the_poses_before(walk, monkeypatch):
+def test_the_odometry_corrects_a_wrong_start_and_rewrites_the_poses_before(sharp, monkeypatch):
     """The first two-view estimate is spoiled: its direction is turned by 50 deg, and no ranges are refined by it."""
     views: list[TwoView] = []
     original = Initialiser._start
@@ -213,18 +218,18 @@ def test_the_odometry_corrects_a_wrong_start_and_rewrites_the_poses_before(walk,
         return replace(start, T_cam_key=poses)
 
     monkeypatch.setattr(Initialiser, "_start", spoiled)
-    odometry = VisualOdometry(walk.sequence.camera)
-    online = [odometry.step(frame) for frame in walk.frames]
+    odometry = VisualOdometry(sharp.sequence.camera)
+    online = [odometry.step(frame) for frame in sharp.frames]
     corrected = [place for place, estimate in enumerate(online) if estimate.reason == "start_corrected"]
     assert len(corrected) == 1
     assert len(views) == 2
     assert online[corrected[0]].state == State.TRACKING
     result = odometry.finish()
-    assert evaluate(result.trajectory, walk.sequence.truth).ate_percent < 0.5
+    assert evaluate(result.trajectory, sharp.sequence.truth).ate_percent < 0.5
     before = corrected[0] - 1
     moved = result.frames[before].T_world_cam[:3, 3] - online[before].T_world_cam[:3, 3]
     assert float(moved.norm()) > 0.02
-    true = lie.se3_inverse(walk.sequence.pose(0)) @ walk.sequence.pose(before)
+    true = lie.se3_inverse(sharp.sequence.pose(0)) @ sharp.sequence.pose(before)
     assert direction_deg(result.frames[before].T_world_cam[:3, 3], true[:3, 3]) < 2
 
 

@@ -2,8 +2,8 @@
 
     python benchmarks/two_view.py runs/<...>/trajectory.txt reference_two_view.json [stella_vslam.txt]
 
-The reference holds `pairs` with frame numbers `i`, `j`, the rotation `R_ji` and the direction `cam_j_center_dir_in_i`. With
-a whole reference trajectory (TUM) the scale of each quarter against it is printed too, relative to the first.
+The reference holds `pairs` with frame numbers `i`, `j`, the rotation `R_ji` and the direction `cam_j_center_dir_in_i`.
+With a whole reference trajectory (TUM) the scale of each quarter against it is printed too, relative to the first.
 """
 
 import json
@@ -37,6 +37,8 @@ def main() -> None:
         scales = []
         for mine, its in zip(ours.tensor_split(4), theirs.tensor_split(4), strict=True):
             S = similarity_from_points(trajectory.positions[mine], reference.positions[its])
+            if S is None:
+                raise SystemExit("a quarter of the trajectory stands still: it has no scale.")
             scales.append(float(torch.linalg.det(S[:3, :3]) ** (1 / 3)))
         print("scale by quarter:", ", ".join(f"{scale / scales[0]:.3f}" for scale in scales))
 

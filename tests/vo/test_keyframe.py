@@ -235,14 +235,18 @@ def test_a_frame_without_texture_gives_an_empty_keyframe(scene):
 
 def test_the_cloud_has_the_trusted_points_in_the_world_with_their_colours(scene):
     key = scene.key()
-    key.T_world_key = lie.se3(lie.so3_exp(torch.tensor([0.1, 0.5, -0.2]).double()), torch.tensor([1.0, 2.0, 3.0]).double())
+    key.T_world_key = lie.se3(
+        lie.so3_exp(torch.tensor([0.1, 0.5, -0.2]).double()), torch.tensor([1.0, 2.0, 3.0]).double()
+    )
     rho, variance, score = key.points
     rho, score = rho.clone(), score.clone()
     rho[0], score[1] = 0.0, 0.0
     key.points = InverseRange(rho, variance, score)
     cloud = to_cloud(key, 0.05)
     assert len(cloud.xyz) == len(key.pixel) - 2
-    p_key = (lie.se3_inverse(key.T_world_key)[:3] @ torch.cat([cloud.xyz.double(), torch.ones(len(cloud.xyz), 1)], 1).T).T
+    p_key = (
+        lie.se3_inverse(key.T_world_key)[:3] @ torch.cat([cloud.xyz.double(), torch.ones(len(cloud.xyz), 1)], 1).T
+    ).T
     torch.testing.assert_close(p_key.norm(dim=-1).float(), scene.range[key.pixel[2:]], rtol=1e-4, atol=1e-4)
     expected = torch.from_numpy(scene.frames[0].colour).reshape(-1, 3)[key.pixel[2:]]
     assert torch.equal(cloud.rgb, expected)

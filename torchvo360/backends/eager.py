@@ -43,10 +43,9 @@ def linearize(
     dtype = reference.value.dtype
     T, ab = T_tgt_ref.to(dtype), affine.to(dtype)
     size = max(256, CHUNK_SAMPLES // max(1, B * C))
-    M = T_tgt_ref.new_zeros(B, 9, 9)
-    cost, total = T_tgt_ref.new_zeros(B), T_tgt_ref.new_zeros(B)
-    for start in range(0, N, size):
-        points = reference.chunk(start, min(start + size, N))
+    parts = []
+    for start in range(0, max(N, 1), size):
+        points = reference if size >= N else reference.chunk(start, min(start + size, N))
         samples = look_up(points, target, T, ab)
         weight, residual = samples.weight, samples.residual
         slope_rows = None
@@ -61,22 +60,23 @@ def linearize(
         S = system_rows(samples, _root(weight * robust_weight))
         if slope_rows is not None:
             S[:, :6] += slope_rows
-        M = M + _gram(S)
-        cost = cost + (weight * robust_cost).sum((1, 2))
-        total = total + weight.sum((1, 2)) * (C / weight.shape[1])
+        parts.append(
+            (_gram(S), (weight * robust_cost).sum((1, 2)).double(), weight.sum((1, 2)).double() * (C / weight.shape[1]))
+        )
+    M, cost, total = (torch.stack(column).sum(0) for column in zip(*parts, strict=True))
     return NormalEquations(M[:, :8, :8], M[:, :8, 8], cost, total, M[:, 8, 8])
 
 
 def _gram(S: Float[Tensor, "B 9 M"]) -> Float64[Tensor, "B 9 9"]:
     """Return `S S^T`, summed block by block."""
     blocks = S.shape[2] // SUM_SAMPLES
+    if blocks < 2 or not len(S):
+        return torch.bmm(S, S.mT).double()
+    # Element by element: the blocks of one are a view, those of all would be a copy.
+    whole = S[..., : blocks * SUM_SAMPLES].unflatten(2, (blocks, SUM_SAMPLES)).transpose(1, 2)
+    total = torch.stack([torch.bmm(part, part.mT).sum(0, dtype=torch.float64) for part in whole])
     rest = S[..., blocks * SUM_SAMPLES :]
-    total = torch.bmm(rest, rest.mT).double()
-    if blocks and len(S):
-        # Element by element: the blocks of one are a view, those of all would be a copy.
-        whole = S[..., : blocks * SUM_SAMPLES].unflatten(2, (blocks, SUM_SAMPLES)).transpose(1, 2)
-        total = total + torch.stack([torch.bmm(part, part.mT).sum(0, dtype=torch.float64) for part in whole])
-    return total
+    return total + torch.bmm(rest, rest.mT) if rest.shape[2] else total
 
 
 def _root(weight: Float[Tensor, "B C N"]) -> Float[Tensor, "B C N"]:

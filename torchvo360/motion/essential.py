@@ -13,7 +13,8 @@ from torchvo360 import lie
 
 SAMPLES = 400
 INLIER_RAD = 2e-3
-"""A tenth of a degree: about a third of a pixel at 1024 x 512, the accuracy of tracked corners."""
+"""A tenth of a degree: about a third of a pixel at 1024 x 512, the accuracy of tracked corners. In smaller images a
+third of a pixel is more, and corners that have been followed through a turn are not better than that."""
 
 
 class TwoView(NamedTuple):
@@ -59,7 +60,11 @@ def inverse_ranges(
 
 
 def estimate_two_view(
-    ref: Float[Tensor, "N 3"], tgt: Float[Tensor, "N 3"], generator: torch.Generator
+    ref: Float[Tensor, "N 3"],
+    tgt: Float[Tensor, "N 3"],
+    generator: torch.Generator,
+    *,
+    inlier_rad: float = INLIER_RAD,
 ) -> TwoView | None:
     """Estimate the motion between two views from matched bearings.
 
@@ -67,6 +72,7 @@ def estimate_two_view(
         ref: Unit bearings in the reference, float64.
         tgt: Their matches in the target.
         generator: Draws the samples.
+        inlier_rad: Sampson angle within which a match is an inlier, radians.
 
     Returns:
         The motion, or None for fewer than 16 matches.
@@ -78,23 +84,23 @@ def estimate_two_view(
     chosen = torch.rand(SAMPLES, N, generator=generator).topk(8, dim=1).indices
     null = torch.linalg.qr(products[chosen].mT, mode="complete").Q[..., 8]
     candidates = _nearest_essential(null.reshape(-1, 3, 3))
-    errors = sampson_angle(candidates, ref, tgt).clamp(max=INLIER_RAD).sum(-1)
+    errors = sampson_angle(candidates, ref, tgt).clamp(max=inlier_rad).sum(-1)
     E = candidates[errors.argmin()]
     for _ in range(5):
         error = sampson_angle(E, ref, tgt)
-        weight = (error < INLIER_RAD) / (1 + (2 * error / INLIER_RAD) ** 2)
+        weight = (error < inlier_rad) / (1 + (2 * error / inlier_rad) ** 2)
         refined = torch.linalg.svd(products * weight[:, None], full_matrices=False).Vh[-1]
         refined = _nearest_essential(refined.reshape(3, 3))
-        if sampson_angle(refined, ref, tgt).clamp(max=INLIER_RAD).sum() > error.clamp(max=INLIER_RAD).sum():
+        if sampson_angle(refined, ref, tgt).clamp(max=inlier_rad).sum() > error.clamp(max=inlier_rad).sum():
             break
         E = refined
-    inlier = sampson_angle(E, ref, tgt) < INLIER_RAD
+    inlier = sampson_angle(E, ref, tgt) < inlier_rad
     if int(inlier.sum()) < 8:
         return None
     R, t = _in_front(E, ref[inlier], tgt[inlier])
-    R, t = _refine(R, t, ref[inlier], tgt[inlier])
+    R, t = _refine(R, t, ref[inlier], tgt[inlier], inlier_rad)
     rho = inverse_ranges(R, t, ref, tgt)
-    inlier = sampson_angle(lie.so3_hat(t) @ R, ref, tgt) < INLIER_RAD
+    inlier = sampson_angle(lie.so3_hat(t) @ R, ref, tgt) < inlier_rad
     turned = ref @ R.mT
     ahead = (rho > 0) & (((turned + rho[:, None] * t) * tgt).sum(-1) > 0)
     angle = torch.atan2(torch.linalg.vector_norm(torch.linalg.cross(turned, tgt), dim=-1), (turned * tgt).sum(-1))
@@ -119,7 +125,11 @@ def _in_front(
 
 
 def _refine(
-    R: Float[Tensor, "3 3"], t: Float[Tensor, "3"], ref: Float[Tensor, "N 3"], tgt: Float[Tensor, "N 3"]
+    R: Float[Tensor, "3 3"],
+    t: Float[Tensor, "3"],
+    ref: Float[Tensor, "N 3"],
+    tgt: Float[Tensor, "N 3"],
+    inlier_rad: float,
 ) -> tuple[Float[Tensor, "3 3"], Float[Tensor, "3"]]:
     """Minimise the Cauchy-weighted Sampson distance over rotation (3) and direction (2) by Gauss-Newton."""
     for _ in range(6):
@@ -133,7 +143,7 @@ def _refine(
         tangent = torch.linalg.svd(t[None], full_matrices=True).Vh[1:]
         by_direction = torch.linalg.cross(turned, tgt) @ tangent.mT
         J = torch.cat([by_rotation, by_direction], -1) * scale[:, None]
-        weight = 1 / (1 + (2 * residual / INLIER_RAD) ** 2)
+        weight = 1 / (1 + (2 * residual / inlier_rad) ** 2)
         A = J.mT @ (J * weight[:, None]) + 1e-9 * torch.eye(5, dtype=J.dtype)
         delta = -torch.linalg.solve(A, J.mT @ (weight * residual))
         R = lie.so3_exp(delta[:3]) @ R

@@ -9,10 +9,13 @@ from jaxtyping import Float, Float64
 from torch import Tensor
 
 from torchvo360.cameras import Camera
-from torchvo360.motion.essential import TwoView, estimate_two_view
+from torchvo360.motion.essential import INLIER_RAD, TwoView, estimate_two_view
 from torchvo360.motion.flow import bearings, find_corners, follow
 from torchvo360.motion.rotation import fit_rotation
 from torchvo360.vo.frame import FrameBuilder, PyramidFrame
+
+INLIER_PX = 0.33
+"""Accuracy of tracked corners."""
 
 
 @dataclass
@@ -58,4 +61,5 @@ class CornerTracks:
 
     def two_view(self, generator: torch.Generator) -> TwoView | None:
         """Return the motion since the reference frame, up to the length of its translation."""
-        return estimate_two_view(self.origins, self.now, generator)
+        inlier_rad = INLIER_RAD if self.camera is None else max(INLIER_RAD, INLIER_PX * self.camera.pixel_angle)
+        return estimate_two_view(self.origins, self.now, generator, inlier_rad=inlier_rad)

@@ -116,6 +116,15 @@ class Initialiser:
             self.reason = "few_tracks"
             return None
         view = self._view()
+        if (
+            view is None
+            and self.reason == "few_inliers"
+            and self.tracks.moved() > math.radians(self.config.parallax_deg)
+        ):
+            # The corners have drifted, for instance through a long turn, and will not get better: take fresh ones.
+            self.begin(frame)
+            self.reason = "few_inliers"
+            return None
         start = None if view is None else self._start(view)
         if start is None:
             self._let_go()

@@ -19,7 +19,6 @@ from torchvo360.cameras import Camera
 from torchvo360.checks import (
     InputError,
     check_finite_number,
-    check_floating,
     check_pose,
     check_same_device,
     check_shape,
@@ -29,6 +28,9 @@ from torchvo360.residuals.direct import Reference, Target, make_target
 from torchvo360.residuals.normal import NormalEquations
 from torchvo360.residuals.weights import LossConfig
 from torchvo360.solve import LMConfig, Solution, Status, inverse_ldl, minimize
+
+MAX_TRANSLATION = 1e6
+"""Starts farther away than this, m, are no start of anything."""
 
 MAX_RHO = 1e9
 """Inverse ranges above this, 1/m, are no range of anything; their squares would overflow in float32."""
@@ -69,6 +71,12 @@ class AlignConfig:
             raise InputError(f"steps_by_level: expected positive numbers of steps, got {self.steps_by_level}.")
         check_finite_number("blur_px", self.blur_px, above=-1e-9)
         check_finite_number("noise", self.noise, above=0)
+        check_finite_number("min_agreement", self.min_agreement, above=-1e-9, at_most=1)
+        if self.saturation is not None:
+            check_finite_number("saturation", self.saturation)
+        if self.coarsest_width < 1 or self.min_pixels < 1:
+            sizes = f"{self.coarsest_width} and {self.min_pixels}"
+            raise InputError(f"coarsest_width, min_pixels: expected at least 1, got {sizes}.")
 
     def level_count(self, camera: Camera) -> int:
         """Return the number of pyramid levels for a camera.
@@ -248,6 +256,7 @@ def solve_level(
     )
 
 
+@torch.no_grad()
 def align(
     ref: Float[Tensor, "*batch C H W"],
     tgt: Float[Tensor, "*batch C H W"],
@@ -261,6 +270,8 @@ def align(
 ) -> AlignResult:
     """Find the motion and brightness change between pairs of images by direct alignment.
 
+    The results are constants: no gradient flows back to the images.
+
     Args:
         ref: Reference images, values in [0, 1], or feature maps with C > 1 channels.
         tgt: Target images of the same size.
@@ -268,7 +279,8 @@ def align(
         camera: The camera of both.
         T_tgt_ref: Where to start; the identity by default.
         mask: Pixels of the reference to use; all by default. Pixels of either image that are not finite are never used.
-        weight: Further weight of each reference pixel, at least 0; 1 by default. Solid angle always applies.
+        weight: Relative weight of each reference pixel, finite and at least 0; only ratios within an image count. Solid
+            angle always applies.
         config: Settings.
 
     Returns:
@@ -276,7 +288,8 @@ def align(
 
     Raises:
         ShapeError: The shapes do not fit each other or the camera.
-        InputError: A tensor is not floating, a weight is negative or a start is not a rigid motion.
+        InputError: A tensor is not float32 or float64, a weight is negative or infinite, a start is not a rigid motion,
+            or a panorama's width is odd.
     """
     config = AlignConfig() if config is None else config
     check_shape("ref", ref, f"... C {camera.height} {camera.width}")
@@ -290,19 +303,28 @@ def align(
     ):
         if value is not None:
             check_shape(name, value, " ".join(str(size) for size in expected))
-    check_floating("ref", ref)
-    check_floating("tgt", tgt)
-    check_floating("rho", rho)
+    for name, value in (("ref", ref), ("tgt", tgt), ("rho", rho)):
+        if value.dtype not in (torch.float32, torch.float64):
+            raise InputError(f"{name}: expected float32 or float64, got {value.dtype}.")
+    if ref.shape[-3] < 1:
+        raise InputError("ref: expected at least one channel, got none.")
+    if camera.wraps and camera.width % 2:
+        raise InputError(f"camera: expected an even width for a full panorama, got {camera.width}.")
     check_same_device(ref=ref, tgt=tgt, rho=rho, T_tgt_ref=T_tgt_ref, mask=mask, weight=weight)
-    if weight is not None and not bool((weight >= 0).all()):
-        raise InputError("weight: expected numbers of at least 0, got a negative or NaN one.")
+    if weight is not None and not bool(((weight >= 0) & torch.isfinite(weight)).all()):
+        raise InputError("weight: expected finite numbers of at least 0, got a negative, infinite or NaN one.")
     if T_tgt_ref is not None:
         check_pose("T_tgt_ref", T_tgt_ref)
+        if not bool((T_tgt_ref[..., :3, 3].abs() < MAX_TRANSLATION).all()):
+            raise InputError(f"T_tgt_ref: expected translations below {MAX_TRANSLATION:g} m, got a longer one.")
 
     B = math.prod(batch)
     flat = [value.reshape(B, *value.shape[len(batch) :]) for value in (ref, tgt.to(ref.dtype), rho.to(ref.dtype))]
     usable = torch.ones_like(flat[2], dtype=torch.bool) if mask is None else mask.reshape(flat[2].shape).bool()
-    each = None if weight is None else weight.reshape(flat[2].shape).to(ref.dtype)
+    each = None
+    if weight is not None:
+        each = weight.reshape(flat[2].shape).double()
+        each = (each / each.amax((1, 2), keepdim=True).clamp_min(torch.finfo(torch.float64).tiny)).to(ref.dtype)
     levels = _levels(flat[0], flat[1], flat[2], usable, each, camera, config)
     if T_tgt_ref is None:
         T = torch.eye(4, dtype=torch.float64, device=ref.device).repeat(B, 1, 1)
@@ -324,6 +346,7 @@ def _coarse_to_fine(
     T, affine = solution.state
     equations = solution.equations
     agreed = agreeing_share(levels[config.finest].reference, levels[config.finest].target, T, affine).double()
+    agreed = agreed.nan_to_num(nan=0.0)
     false_minimum = (solution.status == Status.CONVERGED) & (agreed < config.min_agreement)
     status = torch.where(false_minimum, int(Status.DIVERGED), solution.status)
     fields = {

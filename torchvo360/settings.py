@@ -1,5 +1,6 @@
 """The settings of one run, each with its default and what it means."""
 
+import os
 import re
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -81,8 +82,11 @@ class RunConfig:
             raise InputError(f"mask: expected an image file, a sector or a list of them, got {self.mask!r}.")
         if not 0 <= self.seed <= MAX_SEED:
             raise InputError(f"seed: expected 0 to {MAX_SEED}, got {self.seed}.")
+        most = 4 * (os.cpu_count() or 1)
         if self.threads is not None and self.threads < 1:
             raise InputError(f"threads: expected at least 1, got {self.threads}.")
+        if self.threads is not None and self.threads > most:
+            raise InputError(f"threads: expected at most {most} on this machine, got {self.threads}.")
         _ = self.size
 
     @property

@@ -6,6 +6,7 @@ z forward. A ray is a point with range 1 in the camera's own measure: `scale(ray
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
+from numbers import Integral
 from typing import Self
 
 import torch
@@ -29,7 +30,7 @@ class Camera(ABC):
     def __post_init__(self) -> None:
         for name in ("width", "height"):
             size = getattr(self, name)
-            if not isinstance(size, int) or size < 1:
+            if not isinstance(size, Integral) or isinstance(size, bool) or size < 1:
                 raise InputError(f"{name}: expected a positive integer, got {size!r}.")
         for name, value in zip(("fx", "fy", "cx", "cy"), self.intrinsics, strict=True):
             check_finite_number(name, value)

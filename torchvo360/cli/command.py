@@ -5,8 +5,11 @@ Exit codes: 0 done, 1 a defect of the program (with its traceback), 2 the caller
 """
 
 import argparse
+import importlib
 import os
+import signal
 import sys
+import threading
 from collections.abc import Sequence
 from importlib import metadata
 from pathlib import Path
@@ -40,6 +43,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     for name, value in ENVIRONMENT.items():
         os.environ.setdefault(name, value)
     try:
+        _import_libraries()
         return _main(arguments.overrides, arguments.multirun, arguments.cfg)
     except KeyboardInterrupt:
         print("torchvo360: interrupted.", file=sys.stderr)
@@ -50,6 +54,24 @@ def conf_folder() -> Path:
     """Return the folder of the configuration: inside an installed package, beside that of a checkout."""
     package = Path(__file__).parents[1]
     return package / "conf" if (package / "conf").is_dir() else package.parent / "conf"
+
+
+def _import_libraries() -> None:
+    """Import the heavy libraries with Ctrl-C held back: it would leave them half imported, and be swallowed by some.
+
+    Raises:
+        KeyboardInterrupt: Ctrl-C came meanwhile.
+    """
+    if threading.current_thread() is not threading.main_thread():
+        return
+    came = []
+    before = signal.signal(signal.SIGINT, lambda *_: came.append(True))
+    try:
+        importlib.import_module("torchvo360.cli.jobs")
+    finally:
+        signal.signal(signal.SIGINT, before)
+    if came:
+        raise KeyboardInterrupt
 
 
 def _main(overrides: Sequence[str], multirun: bool, show: bool) -> int:

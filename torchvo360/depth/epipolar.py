@@ -15,7 +15,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from torchvo360.checks import InputError, check_finite_number
-from torchvo360.residuals.direct import Target, look_up_value
+from torchvo360.residuals.direct import Target, look_up_usable
 
 HALF_PATTERN = 2
 """Samples on each side of the centre: 5 in all (S2, section 4.1)."""
@@ -43,8 +43,8 @@ class EpipolarConfig:
     """Standard deviation of the curve's own position, which counts by the angle between gradient and curve."""
 
     def __post_init__(self) -> None:
-        if self.max_half_width_px < 3:
-            raise InputError(f"max_half_width_px: expected at least 3, got {self.max_half_width_px}.")
+        if not 3 <= self.max_half_width_px <= 256:
+            raise InputError(f"max_half_width_px: expected 3 to 256, got {self.max_half_width_px}.")
         for name in ("min_gradient", "max_ssd", "noise", "position_error_px", "line_error_px"):
             check_finite_number(name, getattr(self, name), above=0)
         check_finite_number("min_sine", self.min_sine, above=0, at_most=1)
@@ -168,7 +168,7 @@ def _reference_samples(
     """Look up five samples of the reference along each point's own epipolar curve, one pixel apart."""
     towards = T[:3, :3].mT @ circles.towards
     angle = torch.arange(-HALF_PATTERN, HALF_PATTERN + 1, dtype=ray.dtype, device=ray.device) * step
-    return look_up_value(reference, ray[..., None] * angle.cos() + towards[..., None] * angle.sin())
+    return look_up_usable(reference, ray[..., None] * angle.cos() + towards[..., None] * angle.sin())
 
 
 def _search(
@@ -187,7 +187,7 @@ def _search(
     )
     theta = middle[:, None] + offsets * step
     direction = circles.start[..., None] * theta.cos() + circles.towards[..., None] * theta.sin()
-    window = look_up_value(target, direction).unfold(1, 2 * HALF_PATTERN + 1, 1)
+    window = look_up_usable(target, direction).unfold(1, 2 * HALF_PATTERN + 1, 1)
     ssd = (window - samples[:, None]).square().sum(-1).nan_to_num(nan=torch.inf)
     centre = theta[:, HALF_PATTERN:-HALF_PATTERN]
     inside = (

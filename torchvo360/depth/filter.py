@@ -35,7 +35,7 @@ class FilterConfig:
     """Neighbours are points within this many pixels in both directions."""
     max_score: float = 8.0
     min_score: float = -5.0
-    """Bounds of the score: matches add 1, outliers take 1, failed searches a third; below 0 a point is not used."""
+    """Bounds of the score: matches add 1, outliers take 1, failed searches a third; a point is used above 0."""
 
     def __post_init__(self) -> None:
         check_finite_number("inflation", self.inflation, above=0.999)
@@ -44,8 +44,10 @@ class FilterConfig:
         check_finite_number("variance_floor", self.variance_floor, above=0)
         if not 0 <= self.smoothing <= 1:
             raise InputError(f"smoothing: expected a share between 0 and 1, got {self.smoothing}.")
-        if self.radius_px < 1:
-            raise InputError(f"radius_px: expected at least 1, got {self.radius_px}.")
+        if not 1 <= self.radius_px <= 32:
+            raise InputError(f"radius_px: expected 1 to 32, got {self.radius_px}.")
+        check_finite_number("max_score", self.max_score, above=0)
+        check_finite_number("min_score", self.min_score, at_most=0)
 
 
 class InverseRange(NamedTuple):

@@ -31,7 +31,7 @@ def level_camera(camera: Camera, level: int) -> Camera:
 
 
 def resample(image: Float[Tensor, "*batch H W"], camera: Camera) -> Float[Tensor, "*batch h w"]:
-    """Return the image at a level camera's size, by the mean over each new pixel's area."""
+    """Return the image at a level camera's size, by means over the whole pixels that each new pixel touches."""
     height, width = image.shape[-2:]
     flat = image.reshape(-1, 1, height, width)
     if (height, width) == (camera.height, camera.width):

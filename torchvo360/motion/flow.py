@@ -18,7 +18,12 @@ MAX_RETURN_ERROR_PX = 0.5
 def _extended(image: UInt8[np.ndarray, "H W"], camera: Camera) -> UInt8[np.ndarray, "H Wp"]:
     if not camera.wraps:
         return image
-    return np.concatenate([image[:, -SEAM_MARGIN_PX:], image, image[:, :SEAM_MARGIN_PX]], 1)
+    margin = _seam_margin(camera)
+    return np.concatenate([image[:, camera.width - margin :], image, image[:, :margin]], 1)
+
+
+def _seam_margin(camera: Camera) -> int:
+    return min(SEAM_MARGIN_PX, camera.width) if camera.wraps else 0
 
 
 def find_corners(
@@ -46,7 +51,7 @@ def follow(
     """
     if len(corners) == 0:
         return corners, np.zeros(0, bool)
-    shift = np.array([SEAM_MARGIN_PX if camera.wraps else 0, 0], np.float32) - 0.5
+    shift = np.array([_seam_margin(camera), 0], np.float32) - 0.5
     start = (corners + shift).astype(np.float32)[:, None]
     settings = {
         "winSize": (15, 15),

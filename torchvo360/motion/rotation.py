@@ -1,6 +1,6 @@
 """Rotation between two panoramas without any depth: a global search over SO(3), refined by direct alignment.
 
-At 64 x 32 pixels the whole group costs one batched look-up of some 950 rotations; the best few are refined together.
+At 64 x 32 pixels the whole group costs one batched look-up of about a thousand rotations; the best few are refined.
 """
 
 import math
@@ -120,7 +120,7 @@ def search_rotation(
     Args:
         reference: Points of the reference (batch 1), for instance all pixels of a 64 x 32 level.
         target: The target image (batch 1) of that level.
-        grid: Rotations R_tgt_ref to try, for instance `rotation_grid(0.6)`.
+        grid: Rotations R_tgt_ref to try, for instance `rotation_grid(0.43)`.
         refined: How many of the best are refined.
     """
     dtype = reference.value.dtype

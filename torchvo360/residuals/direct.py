@@ -16,6 +16,9 @@ from torch import Tensor
 from torchvo360.cameras import Camera
 from torchvo360.image import interpolate, locate, pad_image
 
+MIN_CONFIDENCE = 0.99
+"""Looked-up pixels of less confidence than this touch a masked one."""
+
 
 @dataclass(frozen=True)
 class Reference:
@@ -81,7 +84,18 @@ def make_target(
 
 
 def look_up_value(target: Target, ray: Float[Tensor, "3 *points"]) -> Float[Tensor, "*points"]:
-    """Return an image's values along rays of its camera; NaN where the camera does not see them.
+    """Return an image's values along rays of its camera; where the camera does not see them, the nearest edge's.
+
+    Args:
+        target: One image (batch 1) of one channel.
+        ray: Rays in the image's camera.
+    """
+    u, v = target.camera.pixel_of(*(component.reshape(1, -1) for component in ray))
+    return interpolate(target.padded, locate(u, v, target.camera)).value[0, 0].view(ray.shape[1:])
+
+
+def look_up_usable(target: Target, ray: Float[Tensor, "3 *points"]) -> Float[Tensor, "*points"]:
+    """Return an image's values along rays of its camera; NaN where they are unseen, masked or clipped.
 
     Args:
         target: One image (batch 1) of one channel.
@@ -90,7 +104,12 @@ def look_up_value(target: Target, ray: Float[Tensor, "3 *points"]) -> Float[Tens
     x, y, z = (component.reshape(1, -1) for component in ray)
     camera = target.camera
     u, v = camera.pixel_of(x, y, z)
-    value = interpolate(target.padded, locate(u, v, camera)).value[0, 0]
+    taps = locate(u, v, camera)
+    value = interpolate(target.padded, taps).value[0, 0]
+    if target.confidence is not None:
+        value = value.masked_fill(interpolate(target.confidence, taps).value[0, 0] < MIN_CONFIDENCE, torch.nan)
+    if target.saturation is not None:
+        value = value.masked_fill(value >= target.saturation, torch.nan)
     seen = camera.sees(torch.stack([x, y, z], -1), torch.stack([u, v], -1), margin=0.5)
     if seen is not None:
         value = value.masked_fill(~seen[0], torch.nan)

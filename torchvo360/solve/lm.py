@@ -163,7 +163,8 @@ def minimize(
         accepted = usable & (gained > 0)
 
         little = torch.where(accepted, gained, promised) <= config.cost_tolerance * cost
-        converged = solvable & little & (accepted | (promised >= 0))
+        # Under heavy damping every step promises little: that is no sign of a minimum.
+        converged = solvable & little & (accepted | (promised >= 0)) & (damping.value <= 1)
         singular = ~solvable & (damping.value >= 1)
         stalled = ~accepted & (damping.value >= config.max_damping) & ~converged & ~singular
         spent = (steps >= config.max_steps) & ~converged & ~singular & ~stalled

@@ -25,7 +25,7 @@ def to_cloud(key: Keyframe, max_relative_variance: float) -> PointCloud:
     """Return a keyframe's trusted points in the world; points at infinity are left out."""
     keep = key.trusted(max_relative_variance) & (key.points.rho > MIN_RHO)
     p_key = key.ray[:, keep] / key.points.rho[keep]
-    T = key.T_world_key
+    T = key.T_world_key.to(p_key.device)
     xyz = (T[:3, :3] @ p_key.double() + T[:3, 3:]).T.float()
     colour = np.ascontiguousarray(key.frame.colour.reshape(-1, 3)[key.pixel[keep].cpu().numpy()])
     return PointCloud(xyz.cpu(), torch.from_numpy(colour))

@@ -32,10 +32,11 @@ class OdometryConfig:
     filter: FilterConfig = field(default_factory=FilterConfig)
 
     def __post_init__(self) -> None:
-        check_finite_number("blur_px", self.blur_px, above=-1e-9)
+        check_finite_number("blur_px", self.blur_px, above=-1e-9, at_most=5)
         check_finite_number("saturation", self.saturation, above=0)
         check_finite_number("weak_inliers", self.weak_inliers, above=0, at_most=1)
         check_finite_number("lost_inliers", self.lost_inliers, above=0, at_most=self.weak_inliers)
-        for name in ("coarsest_width", "restart_after"):
-            if getattr(self, name) < 1:
-                raise InputError(f"{name}: expected at least 1, got {getattr(self, name)}.")
+        if self.coarsest_width < 16:
+            raise InputError(f"coarsest_width: expected at least 16, got {self.coarsest_width}.")
+        if self.restart_after < 1:
+            raise InputError(f"restart_after: expected at least 1, got {self.restart_after}.")

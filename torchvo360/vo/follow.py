@@ -17,6 +17,9 @@ from torchvo360.vo.keyframe import Keyframe, KeyPoints, make_keyframe
 from torchvo360.vo.recover import Recovery
 from torchvo360.vo.track import Track, track
 
+MAX_PREDICTED = 10
+"""Frames in a row that are given the last motion; then the camera is taken to stand, or a prediction would run away."""
+
 
 def _identity() -> Float64[Tensor, "4 4"]:
     return torch.eye(4, dtype=torch.float64)
@@ -37,12 +40,14 @@ class Follower:
     T_cam_key: Float64[Tensor, "4 4"] = field(default_factory=_identity)
     affine: Float64[Tensor, "2"] = field(default_factory=_no_change)
     motion: Float64[Tensor, "4 4"] = field(default_factory=_identity)
-    """T_cam_last of the last two frames."""
+    """T_cam_last from one frame to the next, by the last two that were found."""
     age: int = 0
     """Frames since the keyframe."""
     placed: PyramidFrame | None = None
     """The last frame that was found, and `T_placed_key` where: frames lost or unusable since do not count."""
     T_placed_key: Float64[Tensor, "4 4"] = field(default_factory=_identity)
+    unplaced: int = 0
+    """Steps since that frame."""
     clouds: list[PointCloud] = field(default_factory=list)
     """Of the keyframes that were left behind."""
 
@@ -52,8 +57,12 @@ class Follower:
         return lie.se3_normalized(self.key.T_world_key @ lie.se3_inverse(self.T_cam_key))
 
     def predict(self) -> None:
-        """Move on by the last motion, for a frame that cannot be used."""
-        self.T_cam_key = lie.se3_normalized(self.motion @ self.T_cam_key)
+        """Move on by the last motion, for a frame that cannot be used; after a few of them, stand."""
+        self.unplaced += 1
+        if self.unplaced <= MAX_PREDICTED:
+            self.T_cam_key = lie.se3_normalized(self.motion @ self.T_cam_key)
+        else:
+            self.stand()
 
     def stand(self) -> None:
         """Stop where the camera is, so that the error of a lost frame cannot run away."""
@@ -61,7 +70,7 @@ class Follower:
 
     def place(self, frame: PyramidFrame) -> None:
         """Remember where a frame was found: the present pose."""
-        self.placed, self.T_placed_key = frame, self.T_cam_key
+        self.placed, self.T_placed_key, self.unplaced = frame, self.T_cam_key, 0
 
     def follow(self, frame: PyramidFrame) -> tuple[Track | None, Float64[Tensor, "4 4"]]:
         """Find a frame, fuse it, and make it a keyframe where that is due.
@@ -78,8 +87,10 @@ class Follower:
         if found is None or found.inliers < config.weak_inliers:
             found = self.recovery.search(self.key, frame, self.placed, self.T_placed_key, self.affine, found)
         if found is None or found.inliers < config.lost_inliers:
+            self.unplaced += 1
             return None, self.T_world_cam
-        self.motion = lie.se3_normalized(found.T_cam_key @ lie.se3_inverse(before))
+        since = lie.se3_log(lie.se3_normalized(found.T_cam_key @ lie.se3_inverse(self.T_placed_key)))
+        self.motion = lie.se3_exp(since / (self.unplaced + 1))
         self.T_cam_key, self.affine = found.T_cam_key, found.affine
         self.age += 1
         T_world_cam = self.T_world_cam

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from torchvo360.cameras import Camera
 from torchvo360.image import gradient_magnitude, level_camera, pad_image, resample
-from torchvo360.residuals.direct import Target, look_up_value
+from torchvo360.residuals.direct import Target, look_up_usable
 
 
 @dataclass(frozen=True)
@@ -27,8 +27,8 @@ class PyramidFrame:
     """Smoothed grey levels in [0, 1], the finest first, padded for look-up; batch 1, one channel."""
 
     def value(self, ray: Float[Tensor, "3 *points"]) -> Float[Tensor, "*points"]:
-        """Return the finest level's intensities along rays; NaN where the camera does not see them."""
-        return look_up_value(self.targets[0], ray)
+        """Return the finest level's intensities along rays; NaN where they are unseen, masked or clipped."""
+        return look_up_usable(self.targets[0], ray)
 
     @property
     def image(self) -> Float[Tensor, "H W"]:

@@ -96,6 +96,8 @@ class Initialiser:
     """The reference and the frames since."""
     rotations: dict[int, Float64[Tensor, "3 3"]] = field(default_factory=dict)
     """R_cam_ref by frame index, of all frames since the reference."""
+    R_ref_before: Float64[Tensor, "3 3"] = field(default_factory=lambda: torch.eye(3, dtype=torch.float64))
+    """Where the reference had to be changed: the rotation since the one before, as far as it is known."""
     reason: str = "first_frame"
     """What the start waits for."""
 
@@ -105,25 +107,25 @@ class Initialiser:
         self.pending, self.rotations = [frame], {frame.index: torch.eye(3, dtype=torch.float64)}
         self.reason = "first_frame"
 
+    def _begin_anew(self, frame: PyramidFrame, R_ref_before: Float64[Tensor, "3 3"], reason: str) -> None:
+        self.begin(frame)
+        self.R_ref_before, self.reason = R_ref_before, reason
+
     def add(self, frame: PyramidFrame) -> Start | None:
         """Follow the corners into a frame; return a start once one can be made.
 
         `reason` then says why not: few_tracks, low_parallax, few_inliers, low_cheirality or refinement_failed;
         `pending[0]` is another frame if the reference had to be changed.
         """
+        turned = self.rotations[self.pending[-1].index]
         if not self._follow(frame):
-            self.begin(frame)
-            self.reason = "few_tracks"
+            self._begin_anew(frame, turned, "few_tracks")
             return None
         view = self._view()
-        if (
-            view is None
-            and self.reason == "few_inliers"
-            and self.tracks.moved() > math.radians(self.config.parallax_deg)
-        ):
+        gate = math.radians(self.config.parallax_deg)
+        if view is None and self.reason == "few_inliers" and self.tracks.moved() > gate:
             # The corners have drifted, for instance through a long turn, and will not get better: take fresh ones.
-            self.begin(frame)
-            self.reason = "few_inliers"
+            self._begin_anew(frame, self.rotations[frame.index], "few_inliers")
             return None
         start = None if view is None else self._start(view)
         if start is None:

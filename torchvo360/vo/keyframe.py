@@ -36,6 +36,7 @@ class MapConfig:
             raise InputError(f"points: expected at least 100, got {self.points}.")
         if self.max_keyframe_gap < 1:
             raise InputError(f"max_keyframe_gap: expected at least 1, got {self.max_keyframe_gap}.")
+        check_finite_number("min_visible", self.min_visible, above=-1e-9, at_most=1)
         check_finite_number("min_gradient", self.min_gradient, above=0)
         check_finite_number("keyframe_parallax_deg", self.keyframe_parallax_deg, above=0)
         check_finite_number("max_relative_variance", self.max_relative_variance, above=0)

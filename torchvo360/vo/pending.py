@@ -1,5 +1,6 @@
 """What becomes of the frames that waited for a start: they are tracked against its keyframe, or interpolated."""
 
+import math
 from dataclasses import replace
 
 import torch
@@ -79,5 +80,7 @@ def fill_in(
             share = (estimate.index - at[right - 1]) / (at[right] - at[right - 1])
             R = rotations.get(estimate.index, known[indices[right]][:3, :3])
             T_key_cam = lie.se3(R.mT, torch.lerp(centres[right - 1], centres[right], share.clamp(0, 1)))
-        out[place] = replace(estimate, T_world_cam=lie.se3_normalized(key.T_world_key @ T_key_cam))
+        # What was measured against another map says nothing of these poses.
+        nothing = {"residual": math.nan, "inliers": math.nan, "a": math.nan, "b": math.nan}
+        out[place] = replace(estimate, T_world_cam=lie.se3_normalized(key.T_world_key @ T_key_cam), **nothing)
     return out

@@ -22,8 +22,9 @@ KEPT = 3
 """Rotations of a global search that are tracked."""
 TRIED_PER_FRAME = 3
 """Earlier keyframes that one lost frame is compared with; the next lost frame goes on where it ended."""
-MIN_AGREEMENT = 0.4
-"""Rotations that match less of the small images' gradient than this are not tracked: unrelated images reach 0.3."""
+MIN_AGREEMENT = 0.15
+"""Rotations that match less of the small images' gradient than this are not tracked: unrelated images reach 0.12, and a
+keyframe whose median parallax is tens of degrees by now only 0.2, though its points are found."""
 
 
 @dataclass(frozen=True)
@@ -124,7 +125,7 @@ class Recovery:
             R = rotations.R_tgt_ref[:KEPT][rotations.agreement[:KEPT] >= MIN_AGREEMENT]
             if R.shape[0] == 0:
                 continue
-            brightness = rotations.affine[0]
+            brightness = rotations.affine[0].cpu()
             found = track(place.key, frame, _turns(R), brightness, self._config, self._limit)
             if found is not None and found.inliers >= min_inliers:
                 self._turn = 0
@@ -133,4 +134,5 @@ class Recovery:
 
 
 def _turns(R: Float64[Tensor, "K 3 3"]) -> Float64[Tensor, "K 4 4"]:
-    return lie.se3(R, R.new_zeros(R.shape[0], 3))
+    """Return motions without translation, where poses are kept: on the CPU."""
+    return lie.se3(R, R.new_zeros(R.shape[0], 3)).cpu()

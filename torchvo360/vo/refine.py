@@ -22,13 +22,11 @@ COUPLING = 1e-3
 
 
 class JointState(NamedTuple):
-    """K poses and brightnesses, N inverse ranges, and how well they fit."""
+    """K poses and brightnesses, N inverse ranges, and the cost with its prior."""
 
     T_tgt_ref: Float64[Tensor, "K 4 4"]
     affine: Float64[Tensor, "K 2"]
     rho: Float[Tensor, "N"]
-    curvature: Float[Tensor, "N"]
-    """Second derivative of the cost by each rho: the inverse of its variance, in units of a squared residual."""
     cost: float
 
 
@@ -156,4 +154,4 @@ def refine_jointly(
             damping *= 8
             if damping > 1e4:
                 break
-    return JointState(T.to(T_tgt_ref.device), ab.to(affine.device), rho, system.H_rho.to(rho.dtype), cost)
+    return JointState(T.to(T_tgt_ref.device), ab.to(affine.device), rho, cost)

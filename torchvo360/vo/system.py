@@ -9,6 +9,7 @@ import math
 import time
 from dataclasses import dataclass, replace
 
+import numpy as np
 import torch
 from jaxtyping import Bool, Float64
 from torch import Tensor
@@ -67,6 +68,9 @@ class VisualOdometry:
         self.config = config = OdometryConfig() if config is None else config
         if mask is not None:
             check_shape("mask", mask, f"{camera.height} {camera.width}")
+            mask = mask.bool()
+        if camera.wraps and camera.width % 2:
+            raise InputError(f"camera: expected an even width for a full panorama, got {camera.width}.")
         levels = 1 + max(0, round(math.log2(max(1.0, camera.width / config.coarsest_width))))
         self._builder = FrameBuilder(camera, levels, config.blur_px, mask, config.saturation, device)
         self._recovery = Recovery(self._builder, config.track, config.map.max_relative_variance)
@@ -123,7 +127,12 @@ class VisualOdometry:
                 raise InputError(f"index: expected more than {last.index}, got {frame.index}.")
         camera = self._builder.cameras[0]
         expected = (camera.height, camera.width, 3)
-        if frame.image is not None and not frame.problem and frame.image.shape != expected:
+        if frame.image is None or frame.problem:
+            return
+        if not isinstance(frame.image, np.ndarray) or frame.image.dtype != np.uint8:
+            kind = getattr(frame.image, "dtype", type(frame.image).__name__)
+            raise InputError(f"image: expected a NumPy array of uint8, got {kind}.")
+        if frame.image.shape != expected:
             raise InputError(f"image: expected shape {list(expected)}, got {list(frame.image.shape)}.")
 
     # Without a map
@@ -152,13 +161,14 @@ class VisualOdometry:
         if not starter.pending:
             starter.begin(frame)
         else:
-            before, last = starter.pending[0], starter.rotations[starter.pending[-1].index]
+            before = starter.pending[0]
             start = starter.add(frame)
             if start is not None:
                 return self._begin_map(start, frame)
             if starter.pending[0] is not before:
                 # The corners ran out: go on from here, with the rotation reached so far.
-                self._T_world_ref = self._T_world_ref @ lie.se3(last.mT, last.new_zeros(3))
+                R = starter.R_ref_before
+                self._T_world_ref = self._T_world_ref @ lie.se3(R.mT, R.new_zeros(3))
         R_cam_ref = starter.rotations[frame.index]
         T_world_cam = self._T_world_ref @ lie.se3(R_cam_ref.mT, R_cam_ref.new_zeros(3))
         return _estimate(frame, T_world_cam, self._waiting, starter.reason, None)

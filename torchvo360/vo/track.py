@@ -10,7 +10,7 @@ from torch import Tensor
 from torchvo360 import lie
 from torchvo360.agreement import agreeing_share
 from torchvo360.alignment import AlignConfig, solve_level
-from torchvo360.checks import InputError
+from torchvo360.checks import InputError, check_finite_number
 from torchvo360.residuals.direct import Reference, look_up
 from torchvo360.residuals.weights import LossConfig
 from torchvo360.solve import LMConfig
@@ -40,6 +40,10 @@ class TrackConfig:
             values = getattr(self, name)
             if not values or min(values) < 1:
                 raise InputError(f"{name}: expected positive numbers, got {values}.")
+        for name in ("noise", "huber", "cutoff"):
+            check_finite_number(name, getattr(self, name), above=0)
+        if self.min_points < 8:
+            raise InputError(f"min_points: expected at least 8, got {self.min_points}.")
 
     def align_config(self, coarsest: bool) -> AlignConfig:
         """Return the settings of one level's solve."""

@@ -87,9 +87,8 @@ def test_pixels_without_weight_do_not_count():
     first, *others = views("room", 2, true)
     points = reference(first)
     below = points.ray[:, 1] > 0.5
-    spoiled = torch.where(
-        below[:, None], torch.rand(1, 1, 2048, generator=torch.Generator().manual_seed(0)), points.value
-    )
+    noise = torch.rand(1, 1, 2048, generator=torch.Generator().manual_seed(0))
+    spoiled = torch.where(below[:, None], noise, points.value)
     masked = Reference(points.ray, points.rho, spoiled, points.weight * ~below)
     for R, image in zip(true, others, strict=True):
         result = search_rotation(masked, target(image), rotation_grid(GRID_STEP_RAD))

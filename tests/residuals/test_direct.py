@@ -20,6 +20,7 @@ from torchvo360.residuals.direct import (
     Samples,
     by_rho,
     look_up,
+    look_up_usable,
     look_up_value,
     make_target,
     system_rows,
@@ -276,15 +277,23 @@ def test_confidence_and_saturation_take_weight_away(batch):
 
 
 @CAMERAS
-def test_look_up_value_shows_the_image_and_nan_where_it_is_not_seen(camera):
+def test_values_are_looked_up_everywhere_and_usable_ones_where_they_are_seen_unmasked_and_unclipped(camera):
     image = torch.rand(
         1, 1, camera.height, camera.width, generator=torch.Generator().manual_seed(0), dtype=torch.float64
     )
-    target = make_target(image, camera)
     rays = camera.ray_grid(dtype=torch.float64).permute(2, 0, 1)
-    torch.testing.assert_close(look_up_value(target, rays), image[0, 0], atol=1e-9, rtol=0)
-    behind = look_up_value(target, -rays)
+    target = make_target(image, camera)
+    for look in (look_up_value, look_up_usable):
+        torch.testing.assert_close(look(target, rays), image[0, 0], atol=1e-9, rtol=0)
+    assert torch.isfinite(look_up_value(target, -rays)).all()
+    behind = look_up_usable(target, -rays)
     assert behind.isnan().all() if not camera.wraps else torch.isfinite(behind).all()
+    confidence = torch.ones_like(image[:, 0])
+    confidence[:, : camera.height // 2] = 0
+    usable = look_up_usable(make_target(image, camera, confidence, 0.7), rays)
+    assert usable[: camera.height // 2].isnan().all()
+    below = image[0, 0, camera.height // 2 :]
+    assert torch.equal(usable[camera.height // 2 :].isnan(), below >= 0.7)
 
 
 def test_parts_of_a_reference_and_a_target_are_its_parts():

@@ -2,7 +2,6 @@
 
 import gc
 import math
-import sys
 import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -207,11 +206,11 @@ def test_equal_runs_give_equal_bits(walk, plain):
     again = run(walk)
     assert torch.equal(again.trajectory.T_world_cam, plain.trajectory.T_world_cam)
     assert torch.equal(again.points.xyz, plain.points.xyz)
-    for first, second in zip(again.frames, plain.frames, strict=True):
-        assert (
-            replace(first, milliseconds=0, T_world_cam=0).__repr__()
-            == replace(second, milliseconds=0, T_world_cam=0).__repr__()
-        )
+    for name in ("index", "t_ns", "state", "reason"):
+        assert [getattr(e, name) for e in again.frames] == [getattr(e, name) for e in plain.frames]
+    for name in ("residual", "inliers", "a", "b"):
+        first, second = ([getattr(e, name) for e in result.frames] for result in (again, plain))
+        np.testing.assert_array_equal(first, second)
 
 
 def test_another_number_of_threads_changes_the_rounding_only(walk, plain):
@@ -219,10 +218,10 @@ def test_another_number_of_threads_changes_the_rounding_only(walk, plain):
     threads = torch.get_num_threads()
     torch.set_num_threads(2)
     try:
-        other = run(walk)
+        other = run(walk.pick(range(30)))
     finally:
         torch.set_num_threads(threads)
-    assert evaluate(other.trajectory, plain.trajectory).ate_percent < 0.05
+    assert evaluate(other.trajectory, plain.trajectory).ate_percent < 0.1
 
 
 @pytest.mark.parametrize("columns", [64, 201])
@@ -355,9 +354,8 @@ def test_a_standstill_before_and_within_the_walk_costs_nothing(walk):
 
 
 def test_a_camera_that_only_turns_has_rotations_and_starts_when_it_walks():
-    config = {"seed": 3, "width": 512, "height": 256}
-    turning = Recording.rendered(motion="rotation", frames=25, **config)
-    walking = SyntheticSequence(SyntheticConfig(frames=30, **config))
+    turning = Recording.rendered(motion="rotation", frames=25, seed=3, width=512, height=256)
+    walking = SyntheticSequence(SyntheticConfig(frames=30, seed=3, width=512, height=256))
     # The walk begins where the turning ended: same place, and its frames turned by the difference.
     start = lie.se3_inverse(walking.pose(0)) @ turning.T_world_cam[-1]
     T = walking.truth.T_world_cam @ lie.se3(start[:3, :3], torch.zeros(3, dtype=torch.float64))
@@ -394,7 +392,7 @@ def test_a_jump_back_is_found_in_an_earlier_keyframe():
     found = [estimate for estimate in back if estimate.state == State.RELOCALISED]
     assert [estimate.reason for estimate in found] == ["earlier_keyframe"]
     first = found[0].index
-    assert first <= 105 + 6
+    assert first <= 105 + 3
     assert {estimate.state for estimate in result.frames[first + 1 :]} == {State.TRACKING}
     placed = [*range(105), *range(first, len(recording))]
     assert errors(result, recording, placed).ate_percent < 0.4, "both visits lie in one world"
@@ -409,8 +407,8 @@ def test_another_world_in_the_middle_is_lost_and_the_first_one_found_again(walk)
     assert reasons
     assert set(reasons) <= {"new_map", "earlier_keyframe", "present_keyframe"}
     assert states(result)[-10:] == [State.TRACKING] * 10
-    home = [*range(40), *range(85, 100)]
-    assert errors(result, recording, home).ate_percent < 1.0
+    assert all(state in PLACED for state in states(result)[72:])
+    assert errors(result, recording, [*range(40), *range(72, 100)]).ate_percent < 0.3, "both visits lie in one world"
 
 
 def test_what_never_comes_back_is_restarted_and_joined(walk):
@@ -481,15 +479,9 @@ def test_frames_are_not_retained(walk, stop_after):
     assert retained_frames() - before <= (2 if stop_after is None else waiting + 2)
 
 
-def test_the_memory_of_a_frame_that_is_past_is_its_estimate_only(walk):
-    """Between two visits of one place nothing but estimates and points of keyframes is added."""
-    odometry = VisualOdometry(walk.camera)
-    for frame in walk.frames:
-        odometry.step(frame)
-    image_bytes = WIDTH * WIDTH // 2 * 3
-    for estimate in odometry.finish().frames:
-        assert sys.getsizeof(estimate) < 1000 < image_bytes
-        assert estimate.T_world_cam.untyped_storage().nbytes() <= 8 * 16
+def test_the_pose_of_a_past_frame_holds_no_larger_tensor_alive(plain):
+    for estimate in plain.frames:
+        assert estimate.T_world_cam.untyped_storage().nbytes() == 8 * 16
 
 
 def test_a_wrong_size_is_refused_in_one_sentence(walk):

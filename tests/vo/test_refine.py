@@ -113,9 +113,7 @@ def test_a_change_of_brightness_is_estimated_along(exact):
     T, rho = perturbed(p, 5)
     out = solve(p, T, rho)
     assert direction_deg(out.T_tgt_ref[-1, :3, 3], p.T_tgt_ref[-1, :3, 3]) < 0.5
-    torch.testing.assert_close(
-        out.affine[:, 0], torch.full((3,), math.log(0.7), dtype=torch.float64), rtol=0, atol=0.03
-    )
+    assert float((out.affine[:, 0] - math.log(0.7)).abs().max()) < 0.03
 
 
 def test_the_gradient_is_that_of_the_cost():

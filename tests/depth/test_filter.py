@@ -18,8 +18,12 @@ def state(rho: list[float], variance: list[float], score: list[float] | None = N
 
 
 def match(rho: list[float], variance: list[float], found: list[bool], searched: list[bool] | None = None):
-    numbers = [torch.tensor(part, dtype=torch.float64) for part in (rho, variance)]
-    return EpipolarMatch(*numbers, torch.tensor(found if searched is None else searched), torch.tensor(found))
+    return EpipolarMatch(
+        torch.tensor(rho, dtype=torch.float64),
+        torch.tensor(variance, dtype=torch.float64),
+        torch.tensor(found if searched is None else searched),
+        torch.tensor(found),
+    )
 
 
 def test_a_match_is_fused_by_the_kalman_update_of_a_scalar():

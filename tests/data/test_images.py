@@ -436,6 +436,8 @@ def test_fewer_than_two_frames_are_refused(tmp_path, kind):
         ({"start": 5, "stop": 5}, r"stop: expected more than start \(5\), got 5"),
         ({"stop": -1}, r"stop: expected more than start \(0\), got -1"),
         ({"every": 0}, "every: expected at least 1, got 0"),
+        ({"fps": 1e-300}, r"fps: expected a frame rate from 0\.001 to 1e\+06, got 1e-300"),
+        ({"fps": 1e10}, r"fps: expected a frame rate from 0\.001 to 1e\+06, got 10000000000\.0"),
         ({"fps": 0.0}, r"fps: expected a frame rate above 0, got 0\.0"),
         ({"fps": float("nan")}, "fps: expected a frame rate above 0, got nan"),
         ({"resize": (512, 255)}, "resize: expected a width of twice the height, got 512 x 255"),

@@ -182,7 +182,8 @@ def test_running_out_of_steps_keeps_the_best_state():
 
 
 @BOTH
-def test_a_wrong_slope_stalls(damping):
+@pytest.mark.parametrize("tolerance", [LMConfig().cost_tolerance, 1e-12])
+def test_a_wrong_slope_stalls(damping, tolerance):
     # The slope points uphill: no step lowers the cost, however short.
     def linearize(state: tuple[Tensor, ...], index: Tensor) -> NormalEquations:
         x = state[0]
@@ -190,7 +191,7 @@ def test_a_wrong_slope_stalls(damping):
         return NormalEquations(one[:, None, None], -one[:, None], 100 + x[:, 0], 100 * one, one)
 
     solution = minimize(
-        linearize, lambda s, d: (s[0] + d,), (starts((0.5,)),), LMConfig(damping=damping, cost_tolerance=1e-12),
+        linearize, lambda s, d: (s[0] + d,), (starts((0.5,)),), LMConfig(damping=damping, cost_tolerance=tolerance),
         step_scale=torch.ones(1, 1), free=torch.tensor([True]), min_weight=10.0,
     )  # fmt: skip
     assert status(solution) == ["STALLED"]

@@ -5,6 +5,7 @@ told by `Frame.problem`, and the sequence goes on.
 """
 
 import glob
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -173,8 +174,10 @@ def open_images(
     """
     check_choice("camera.fit", camera_fit, ("none", "stretch", "crop"))
     _check_selection(start, stop, every)
+    if fps is not None and not (math.isfinite(fps) and fps > 0):
+        raise InputError(f"fps: expected a frame rate above 0, got {fps}.")
     if fps is not None and not MIN_FPS <= fps <= MAX_FPS:
-        raise InputError(f"fps: expected a frame rate above 0, from {MIN_FPS:g} to {MAX_FPS:g}, got {fps:g}.")
+        raise InputError(f"fps: expected a frame rate from {MIN_FPS:g} to {MAX_FPS:g}, got {fps}.")
     if resize is not None and (len(resize) != 2 or min(resize) < 1 or resize[0] != 2 * resize[1]):
         raise InputError(f"resize: expected a width of twice the height, got {' x '.join(map(str, resize))}.")
     source = _open_source(path, fps)

@@ -292,6 +292,34 @@ def align(
             or a panorama's width is odd.
     """
     config = AlignConfig() if config is None else config
+    _check_inputs(ref, tgt, rho, camera, T_tgt_ref, mask, weight)
+    batch = ref.shape[:-3]
+    B = math.prod(batch)
+    flat = [value.reshape(B, *value.shape[len(batch) :]) for value in (ref, tgt.to(ref.dtype), rho.to(ref.dtype))]
+    usable = torch.ones_like(flat[2], dtype=torch.bool) if mask is None else mask.reshape(flat[2].shape).bool()
+    each = None
+    if weight is not None:
+        each = weight.reshape(flat[2].shape).double()
+        each = (each / each.amax((1, 2), keepdim=True).clamp_min(torch.finfo(torch.float64).tiny)).to(ref.dtype)
+    levels = _levels(flat[0], flat[1], flat[2], usable, each, camera, config)
+    if T_tgt_ref is None:
+        T = torch.eye(4, dtype=torch.float64, device=ref.device).repeat(B, 1, 1)
+    else:
+        T = T_tgt_ref.reshape(B, 4, 4).double()
+    affine = match_brightness(levels[-1].reference, levels[-1].target) if config.affine else T.new_zeros(B, 2)
+    return _coarse_to_fine(levels, T, affine, config, batch)
+
+
+def _check_inputs(
+    ref: Tensor,
+    tgt: Tensor,
+    rho: Tensor,
+    camera: Camera,
+    T_tgt_ref: Tensor | None,
+    mask: Tensor | None,
+    weight: Tensor | None,
+) -> None:
+    """Refuse what `align` cannot work with, as its docstring says."""
     check_shape("ref", ref, f"... C {camera.height} {camera.width}")
     batch = ref.shape[:-3]
     for name, value, expected in (
@@ -317,21 +345,6 @@ def align(
         check_pose("T_tgt_ref", T_tgt_ref)
         if not bool((T_tgt_ref[..., :3, 3].abs() < MAX_TRANSLATION).all()):
             raise InputError(f"T_tgt_ref: expected translations below {MAX_TRANSLATION:g} m, got a longer one.")
-
-    B = math.prod(batch)
-    flat = [value.reshape(B, *value.shape[len(batch) :]) for value in (ref, tgt.to(ref.dtype), rho.to(ref.dtype))]
-    usable = torch.ones_like(flat[2], dtype=torch.bool) if mask is None else mask.reshape(flat[2].shape).bool()
-    each = None
-    if weight is not None:
-        each = weight.reshape(flat[2].shape).double()
-        each = (each / each.amax((1, 2), keepdim=True).clamp_min(torch.finfo(torch.float64).tiny)).to(ref.dtype)
-    levels = _levels(flat[0], flat[1], flat[2], usable, each, camera, config)
-    if T_tgt_ref is None:
-        T = torch.eye(4, dtype=torch.float64, device=ref.device).repeat(B, 1, 1)
-    else:
-        T = T_tgt_ref.reshape(B, 4, 4).double()
-    affine = match_brightness(levels[-1].reference, levels[-1].target) if config.affine else T.new_zeros(B, 2)
-    return _coarse_to_fine(levels, T, affine, config, batch)
 
 
 def _coarse_to_fine(

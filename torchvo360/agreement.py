@@ -30,12 +30,16 @@ def agreeing_share(
         Between 0 and 1; 0 where the images have no gradient or no point is seen.
     """
     dtype = reference.value.dtype
-    samples = look_up(reference, target, T_tgt_ref.to(dtype), affine.to(dtype))
+    return share_beyond_chance(look_up(reference, target, T_tgt_ref.to(dtype), affine.to(dtype)), target.camera)
+
+
+def share_beyond_chance(samples: Samples, camera: Camera) -> Float[Tensor, "B"]:
+    """Return `agreeing_share` of samples that have been looked up already."""
     value = samples.residual + samples.gained
-    total = samples.weight.sum(2, keepdim=True).clamp_min(torch.finfo(dtype).tiny)
+    total = samples.weight.sum(2, keepdim=True).clamp_min(torch.finfo(samples.weight.dtype).tiny)
     mean = (value * samples.weight).sum(2, keepdim=True) / total
-    chance = share_of_samples(samples._replace(residual=value - mean), target.camera)
-    share = share_of_samples(samples, target.camera)
+    chance = share_of_samples(samples._replace(residual=value - mean), camera)
+    share = share_of_samples(samples, camera)
     return ((share - chance) / (1 - chance).clamp_min(1e-3)).clamp_min(0.0)
 
 

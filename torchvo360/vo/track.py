@@ -8,7 +8,7 @@ from jaxtyping import Float64, Int64
 from torch import Tensor
 
 from torchvo360 import lie
-from torchvo360.agreement import agreeing_share
+from torchvo360.agreement import share_beyond_chance
 from torchvo360.alignment import AlignConfig, solve_level
 from torchvo360.checks import InputError, check_finite_number
 from torchvo360.residuals.direct import Reference, look_up
@@ -140,5 +140,5 @@ def measure(
     weight = samples.weight.sum().clamp_min(1e-9)
     residual = float((samples.residual.abs() * samples.weight).sum() / weight)
     # Beyond chance: in an unrelated image of strong contrast a gain of zero explains most of the gradient.
-    inliers = float(agreeing_share(reference, frame.targets[0], T_cam_key[None], affine[None])[0])
+    inliers = float(share_beyond_chance(samples, frame.targets[0].camera)[0])
     return Track(T_cam_key, affine, residual, inliers)

@@ -5,13 +5,14 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from torchvo360 import lie
-    from torchvo360.alignment import AlignConfig, AlignResult, align
+    from torchvo360.alignment import Align, AlignConfig, AlignResult, align
     from torchvo360.cameras import Equirectangular, Pinhole
     from torchvo360.evaluation import evaluate
     from torchvo360.solve import Status
     from torchvo360.vo import VisualOdometry
 
 __all__ = [
+    "Align",
     "AlignConfig",
     "AlignResult",
     "Equirectangular",
@@ -24,6 +25,7 @@ __all__ = [
 ]
 
 _HOMES = {
+    "Align": "alignment",
     "AlignConfig": "alignment",
     "AlignResult": "alignment",
     "align": "alignment",

@@ -92,6 +92,21 @@ def check_choice(name: str, value: str, choices: Sequence[str]) -> None:
         raise InputError(f"{name}: expected one of {', '.join(choices)}, got {value!r}.")
 
 
+def is_pose(T: Tensor, *, tolerance: float = 1e-3) -> Tensor:
+    """Return which of the matrices [..., 4, 4] are rigid motions: finite, R orthonormal with determinant +1.
+
+    It has no branches and no gradient.
+    """
+    T = T.detach()
+    finite = torch.isfinite(T).flatten(-2).all(-1)
+    safe = torch.where(finite[..., None, None], T, 0.0)
+    R = safe[..., :3, :3]
+    eye = torch.eye(4, dtype=T.dtype, device=T.device)
+    orthonormal = ((R @ R.mT - eye[:3, :3]).abs() < tolerance).flatten(-2).all(-1)
+    last = ((safe[..., 3, :] - eye[3]).abs() < tolerance).all(-1)
+    return finite & orthonormal & (torch.linalg.det(R) > 0) & last
+
+
 def check_pose(name: str, T: Tensor, *, tolerance: float = 1e-3) -> None:
     """Refuse a tensor that does not hold rigid motions [..., 4, 4].
 
@@ -101,14 +116,5 @@ def check_pose(name: str, T: Tensor, *, tolerance: float = 1e-3) -> None:
     """
     check_shape(name, T, "... 4 4")
     check_floating(name, T)
-    R = T[..., :3, :3].detach()
-    eye = torch.eye(3, dtype=T.dtype, device=T.device)
-    last = torch.tensor([0.0, 0.0, 0.0, 1.0], dtype=T.dtype, device=T.device)
-    rigid = (
-        bool(torch.isfinite(T).all())
-        and bool(((R @ R.mT - eye).abs() < tolerance).all())
-        and bool((torch.linalg.det(R) > 0).all())
-        and bool(((T[..., 3, :].detach() - last).abs() < tolerance).all())
-    )
-    if not rigid:
+    if not bool(is_pose(T, tolerance=tolerance).all()):
         raise InputError(f"{name}: expected rigid motions (orthonormal R, last row 0 0 0 1), got another matrix.")

@@ -12,7 +12,7 @@ from torch.func import jacrev, vmap
 from torchvo360.checks import InputError
 from torchvo360.residuals.normal import NormalEquations
 from torchvo360.solve import LMConfig, Solution, Status, minimize
-from torchvo360.solve.lm import Damping, initial_damping, next_damping
+from torchvo360.solve.damping import Damping, initial_damping, next_damping
 
 BOTH = pytest.mark.parametrize("damping", ["gain_ratio", "lsd"])
 
@@ -288,7 +288,7 @@ def test_each_element_has_its_own_damping():
 
 def test_every_status_has_a_sentence():
     sentences = {value.sentence for value in Status}
-    assert len(sentences) == len(Status) == 6
+    assert len(sentences) == len(Status) == 7
     assert all(sentence.endswith(".") and sentence[0].isupper() for sentence in sentences)
 
 

@@ -1,5 +1,5 @@
-"""The hot kernel `linearize`, one signature for every backend."""
+"""The hot kernel: `linearize`, one signature for every backend, and `gradient` for what differentiates it."""
 
-from torchvo360.backends.eager import linearize
+from torchvo360.backends.eager import gradient, linearize
 
-__all__ = ["linearize"]
+__all__ = ["gradient", "linearize"]

@@ -2,15 +2,26 @@
 
 `linearize` never keeps the Jacobian: rows are built, weighted and contracted chunk by chunk into one 9 x 9 matrix
 `S W S^T` per pair, where the ninth row is the residual. The chunk is small enough for its rows to stay in the cache.
+How samples are divided depends on the points alone: a pair gets the same bits whatever else is in its batch.
 """
+
+from collections.abc import Iterator
 
 import torch
 from jaxtyping import Float, Float64
 from torch import Tensor
 
-from torchvo360.residuals.direct import Reference, Target, by_rho, look_up, system_rows, weight_slope_rows
+from torchvo360.residuals.direct import (
+    Reference,
+    Target,
+    look_up,
+    row_sums,
+    system_rows,
+    weight_slope_rows,
+    weight_slope_sums,
+)
 from torchvo360.residuals.normal import NormalEquations
-from torchvo360.residuals.weights import LossConfig, depth_variance_weight, robust
+from torchvo360.residuals.weights import LossConfig, weigh
 
 CHUNK_SAMPLES = 49152
 """Samples in one go; measured fastest between 32768 and 65536 on a core with 1 MB of L2 cache."""
@@ -38,33 +49,71 @@ def linearize(
         loss: The robust loss.
         noise: Standard deviation of an intensity, for the weights of points with a variance.
     """
-    B, N = reference.rho.shape
     C = reference.value.shape[1]
+    groups = []
+    for chunks in _divided(reference, target, T_tgt_ref, affine):
+        parts = []
+        for points, images, T, ab in chunks:
+            samples = look_up(points, images, T, ab)
+            weighed = weigh(samples, points, T[:, :3, 3], loss, noise)
+            S = system_rows(samples, _root(samples.weight * weighed.weight))
+            if weighed.slope is not None:
+                factor = weighed.slope * samples.residual * _root(samples.weight * weighed.weight)
+                S[:, :6] += weight_slope_rows(samples, factor, T[:, :3, 3])
+            cost = (samples.weight * weighed.cost).sum((1, 2)).double()
+            weight = samples.weight.sum((1, 2)).double() * (C / samples.weight.shape[1])
+            parts.append((_gram(S), cost, weight))
+        groups.append([torch.stack(column).sum(0) for column in zip(*parts, strict=True)])
+    M, cost, total = (torch.cat(column) for column in zip(*groups, strict=True))
+    return NormalEquations(M[:, :8, :8], M[:, :8, 8], cost, total, M[:, 8, 8])
+
+
+def gradient(
+    reference: Reference,
+    target: Target,
+    T_tgt_ref: Float[Tensor, "B 4 4"],
+    affine: Float[Tensor, "B 2"],
+    loss: LossConfig,
+    *,
+    noise: float = 4 / 255,
+) -> Float64[Tensor, "B 8"]:
+    """Return only the `g` of `linearize`, in a form that is cheap to differentiate: no rows, two passes over G."""
+    groups = []
+    for chunks in _divided(reference, target, T_tgt_ref, affine):
+        parts = []
+        for points, images, T, ab in chunks:
+            samples = look_up(points, images, T, ab)
+            weighed = weigh(samples, points, T[:, :3, 3], loss, noise)
+            pull = samples.weight * weighed.weight * samples.residual
+            part = row_sums(samples, pull)
+            if weighed.slope is not None:
+                slope_part = weight_slope_sums(samples, weighed.slope * samples.residual * pull, T[:, :3, 3])
+                part = torch.cat([part[:, :6] + slope_part, part[:, 6:]], -1)
+            parts.append(part)
+        groups.append(torch.stack(parts).sum(0))
+    return torch.cat(groups)
+
+
+Part = tuple[Reference, Target, Tensor, Tensor]
+
+
+def _divided(reference: Reference, target: Target, T_tgt_ref: Tensor, affine: Tensor) -> Iterator[Iterator[Part]]:
+    """Divide pairs into groups, and each group's points into chunks, of about `CHUNK_SAMPLES` samples."""
+    B, N = reference.rho.shape
     dtype = reference.value.dtype
     T, ab = T_tgt_ref.to(dtype), affine.to(dtype)
-    size = max(256, CHUNK_SAMPLES // max(1, B * C))
-    parts = []
-    for start in range(0, max(N, 1), size):
-        points = reference if size >= N else reference.chunk(start, min(start + size, N))
-        samples = look_up(points, target, T, ab)
-        weight, residual = samples.weight, samples.residual
-        slope_rows = None
-        if points.variance is not None:
-            t = T[:, :3, 3]
-            by_depth, slope = depth_variance_weight(by_rho(samples, t), points.variance[:, None], noise)
-            robust_weight, robust_cost = robust(residual * by_depth.sqrt(), loss)
-            robust_weight = robust_weight * by_depth
-            slope_rows = weight_slope_rows(samples, slope * residual * _root(weight * robust_weight), t)
-        else:
-            robust_weight, robust_cost = robust(residual, loss)
-        S = system_rows(samples, _root(weight * robust_weight))
-        if slope_rows is not None:
-            S[:, :6] += slope_rows
-        parts.append(
-            (_gram(S), (weight * robust_cost).sum((1, 2)).double(), weight.sum((1, 2)).double() * (C / weight.shape[1]))
-        )
-    M, cost, total = (torch.stack(column).sum(0) for column in zip(*parts, strict=True))
-    return NormalEquations(M[:, :8, :8], M[:, :8, 8], cost, total, M[:, 8, 8])
+    most = max(256, CHUNK_SAMPLES // reference.value.shape[1])
+    group = max(1, most // max(N, 1))
+
+    def chunks(pairs: slice) -> Iterator[Part]:
+        points, images, T_group, ab_group = reference, target, T, ab
+        if group < B:
+            points, images, T_group, ab_group = reference.take(pairs), target.take(pairs), T[pairs], ab[pairs]
+        for start in range(0, max(N, 1), most):
+            yield (points if most >= N else points.chunk(start, min(start + most, N))), images, T_group, ab_group
+
+    for first in range(0, max(B, 1), group):
+        yield chunks(slice(first, first + group))
 
 
 def _gram(S: Float[Tensor, "B 9 M"]) -> Float64[Tensor, "B 9 9"]:

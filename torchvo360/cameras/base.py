@@ -15,13 +15,17 @@ from torch import Tensor
 
 from torchvo360.checks import InputError, check_finite_number, check_shape
 
+Intrinsics = tuple[float | Tensor, float | Tensor, float | Tensor, float | Tensor]
+"""fx, fy, cx, cy in pixels: numbers, or tensors that broadcast with the points."""
+
 
 @dataclass(frozen=True)
 class Camera(ABC):
     """A central camera with intrinsics k = (fx, fy, cx, cy), in pixels.
 
     Every point below is in the camera frame; functions take any batch shape. Rays and points are given on the last
-    axis, which need not be the contiguous one.
+    axis, which need not be the contiguous one. Where a function takes k, it stands in for the camera's own intrinsics
+    and carries gradients; whether the image wraps and how large it is stays the camera's.
     """
 
     width: int
@@ -48,7 +52,7 @@ class Camera(ABC):
         """Whether column 0 is the last one's neighbour and the poles lie on the top and bottom edges."""
 
     @abstractmethod
-    def ray(self, uv: Float[Tensor, "*batch 2"]) -> Float[Tensor, "*batch 3"]:
+    def ray(self, uv: Float[Tensor, "*batch 2"], k: Intrinsics | None = None) -> Float[Tensor, "*batch 3"]:
         """Return the ray of a pixel: a point with `scale(ray) == 1`."""
 
     @abstractmethod
@@ -63,7 +67,11 @@ class Camera(ABC):
 
     @abstractmethod
     def pixel_of(
-        self, x: Float[Tensor, "*batch"], y: Float[Tensor, "*batch"], z: Float[Tensor, "*batch"]
+        self,
+        x: Float[Tensor, "*batch"],
+        y: Float[Tensor, "*batch"],
+        z: Float[Tensor, "*batch"],
+        k: Intrinsics | None = None,
     ) -> tuple[Float[Tensor, "*batch"], Float[Tensor, "*batch"]]:
         """Return u and v of a point: the bare formula, without seam handling or validity, for the hot path.
 
@@ -76,12 +84,14 @@ class Camera(ABC):
         ray: tuple[Float[Tensor, "*batch"], Float[Tensor, "*batch"], Float[Tensor, "*batch"]],
         g_u: Float[Tensor, "*batch"],
         g_v: Float[Tensor, "*batch"],
+        k: Intrinsics | None = None,
     ) -> tuple[Float[Tensor, "*batch"], Float[Tensor, "*batch"], Float[Tensor, "*batch"]]:
         """Return the three components of `covector`, for the hot path."""
 
     def pixel(self, p_cam: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 2"]:
         """Return the pixel of a point without seam handling or validity; finite everywhere."""
-        return torch.stack(self.pixel_of(*p_cam.unbind(-1)), -1)
+        x, y, z = p_cam.unbind(-1)
+        return torch.stack(self.pixel_of(x, y, z), -1)
 
     @abstractmethod
     def project(self, p_cam: Float[Tensor, "*batch 3"]) -> tuple[Float[Tensor, "*batch 2"], Bool[Tensor, "*batch"]]:
@@ -109,7 +119,7 @@ class Camera(ABC):
             g_uv: Gradient of a value by u and v, per pixel.
         """
         x, y, z = ray.unbind(-1)
-        return torch.stack(self.covector_of((x, y, z), *g_uv.unbind(-1)), -1)
+        return torch.stack(self.covector_of((x, y, z), g_uv[..., 0], g_uv[..., 1]), -1)
 
     @abstractmethod
     def ray_jacobian_intrinsics(self, uv: Float[Tensor, "*batch 2"]) -> Float[Tensor, "*batch 3 4"]:

@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from torchvo360.cameras.base import Camera
+from torchvo360.cameras.base import Camera, Intrinsics
 from torchvo360.checks import check_shape
 
 AXIS_SHIFT = 1e-18
@@ -55,14 +55,14 @@ class Equirectangular(Camera):
         return float(self.width) if self.wraps else abs(self.intrinsics[0]) * math.tau
 
     def _longitude_latitude(
-        self, uv: Float[Tensor, "*batch 2"]
+        self, uv: Float[Tensor, "*batch 2"], k: Intrinsics | None = None
     ) -> tuple[Float[Tensor, "*batch"], Float[Tensor, "*batch"]]:
-        fx, fy, cx, cy = self.intrinsics
+        fx, fy, cx, cy = self.intrinsics if k is None else k
         return (uv[..., 0] - cx) / fx, (uv[..., 1] - cy) / fy
 
-    def ray(self, uv: Float[Tensor, "*batch 2"]) -> Float[Tensor, "*batch 3"]:
+    def ray(self, uv: Float[Tensor, "*batch 2"], k: Intrinsics | None = None) -> Float[Tensor, "*batch 3"]:
         check_shape("uv", uv, "... 2")
-        lon, lat = self._longitude_latitude(uv)
+        lon, lat = self._longitude_latitude(uv, k)
         cos_lat = lat.cos()
         return torch.stack([cos_lat * lon.sin(), -lat.sin(), cos_lat * lon.cos()], -1)
 
@@ -75,13 +75,17 @@ class Equirectangular(Camera):
         return torch.addcmul(torch.addcmul(x * x, y, y), z, z).add(AXIS_SHIFT**2).sqrt()
 
     def pixel_of(
-        self, x: Float[Tensor, "*batch"], y: Float[Tensor, "*batch"], z: Float[Tensor, "*batch"]
+        self,
+        x: Float[Tensor, "*batch"],
+        y: Float[Tensor, "*batch"],
+        z: Float[Tensor, "*batch"],
+        k: Intrinsics | None = None,
     ) -> tuple[Float[Tensor, "*batch"], Float[Tensor, "*batch"]]:
-        fx, fy, cx, cy = self.intrinsics
+        fx, fy, cx, cy = self.intrinsics if k is None else k
         lon, minus_lat = self._longitude_minus_latitude_of(x, y, z)
         u = lon * fx + cx
-        if not (self.wraps and cx == self.width / 2):
-            u = torch.remainder(u, self._period)
+        if k is not None or not (self.wraps and cx == self.width / 2):
+            u = torch.remainder(u, self._period if self.wraps else abs(fx) * math.tau)
         return u, minus_lat * -fy + cy
 
     def _longitude_minus_latitude_of(
@@ -125,13 +129,14 @@ class Equirectangular(Camera):
         ray: tuple[Float[Tensor, "*batch"], Float[Tensor, "*batch"], Float[Tensor, "*batch"]],
         g_u: Float[Tensor, "*batch"],
         g_v: Float[Tensor, "*batch"],
+        k: Intrinsics | None = None,
     ) -> tuple[Float[Tensor, "*batch"], Float[Tensor, "*batch"], Float[Tensor, "*batch"]]:
-        fx, fy, _, _ = self.intrinsics
+        fx, fy, _, _ = self.intrinsics if k is None else k
         x, y, z = ray
         # Nearer to a pole than the first row's centre an interpolated gradient along u no longer shrinks with cos(lat):
         # there 1 / cos(lat) is held at that row's value, or G would grow without bound; G . ray stays 0.
         horizontal2 = torch.addcmul(x * x, z, z)
-        inv_cos_lat = horizontal2.clamp_min(math.sin(0.5 / fy) ** 2).rsqrt()
+        inv_cos_lat = horizontal2.clamp_min(math.sin(0.5 / self.intrinsics[1]) ** 2).rsqrt()
         along_lat = g_v * fy
         radial = along_lat * y * inv_cos_lat
         turn = g_u * fx * inv_cos_lat * inv_cos_lat

@@ -7,7 +7,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from torchvo360.cameras.base import Camera
+from torchvo360.cameras.base import Camera, Intrinsics
 from torchvo360.checks import check_shape
 
 MIN_DEPTH = 1e-12
@@ -35,10 +35,11 @@ class Pinhole(Camera):
     def wraps(self) -> bool:
         return False
 
-    def ray(self, uv: Float[Tensor, "*batch 2"]) -> Float[Tensor, "*batch 3"]:
+    def ray(self, uv: Float[Tensor, "*batch 2"], k: Intrinsics | None = None) -> Float[Tensor, "*batch 3"]:
         check_shape("uv", uv, "... 2")
-        u, v = uv.unbind(-1)
-        return torch.stack([(u - self.cx) / self.fx, (v - self.cy) / self.fy, torch.ones_like(u)], -1)
+        fx, fy, cx, cy = self.intrinsics if k is None else k
+        x, y = (uv[..., 0] - cx) / fx, (uv[..., 1] - cy) / fy
+        return torch.stack([x, y, torch.ones_like(x)], -1)
 
     def scale(self, p_cam: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch"]:
         return p_cam[..., 2]
@@ -49,11 +50,16 @@ class Pinhole(Camera):
         return z.clamp_min(MIN_DEPTH)
 
     def pixel_of(
-        self, x: Float[Tensor, "*batch"], y: Float[Tensor, "*batch"], z: Float[Tensor, "*batch"]
+        self,
+        x: Float[Tensor, "*batch"],
+        y: Float[Tensor, "*batch"],
+        z: Float[Tensor, "*batch"],
+        k: Intrinsics | None = None,
     ) -> tuple[Float[Tensor, "*batch"], Float[Tensor, "*batch"]]:
+        fx, fy, cx, cy = self.intrinsics if k is None else k
         # Points at or behind the plane z = 0 get a finite pixel, and `sees` refuses them.
         inv_z = z.clamp_min(MIN_DEPTH).reciprocal()
-        return x * inv_z * self.fx + self.cx, y * inv_z * self.fy + self.cy
+        return x * inv_z * fx + cx, y * inv_z * fy + cy
 
     def project(self, p_cam: Float[Tensor, "*batch 3"]) -> tuple[Float[Tensor, "*batch 2"], Bool[Tensor, "*batch"]]:
         check_shape("p_cam", p_cam, "... 3")
@@ -72,9 +78,11 @@ class Pinhole(Camera):
         ray: tuple[Float[Tensor, "*batch"], Float[Tensor, "*batch"], Float[Tensor, "*batch"]],
         g_u: Float[Tensor, "*batch"],
         g_v: Float[Tensor, "*batch"],
+        k: Intrinsics | None = None,
     ) -> tuple[Float[Tensor, "*batch"], Float[Tensor, "*batch"], Float[Tensor, "*batch"]]:
+        fx, fy, _, _ = self.intrinsics if k is None else k
         x, y, _ = ray
-        Gx, Gy = g_u * self.fx, g_v * self.fy
+        Gx, Gy = g_u * fx, g_v * fy
         return Gx, Gy, -(Gx * x + Gy * y)
 
     def ray_jacobian_intrinsics(self, uv: Float[Tensor, "*batch 2"]) -> Float[Tensor, "*batch 3 4"]:

@@ -10,10 +10,10 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Float64
 from torch import Tensor
 
-from torchvo360.cameras import Camera
+from torchvo360.cameras import Camera, Intrinsics
 from torchvo360.image import interpolate, locate, pad_image
 
 MIN_CONFIDENCE = 0.99
@@ -35,8 +35,8 @@ class Reference:
     variance: Float[Tensor, "B N"] | None = None
     """Variance of rho, 1/m^2; None where it is taken as exact."""
 
-    def take(self, index: Tensor) -> "Reference":
-        """Return the batch elements of an index."""
+    def take(self, index: Tensor | slice) -> "Reference":
+        """Return the batch elements of an index or a slice."""
         ray = self.ray if self.ray.shape[0] == 1 else self.ray[index]
         variance = None if self.variance is None else self.variance[index]
         return Reference(ray, self.rho[index], self.value[index], self.weight[index], variance)
@@ -64,10 +64,21 @@ class Target:
     saturation: float | None = None
     """Values at or above this are clipped by the sensor and weigh nothing."""
 
-    def take(self, index: Tensor) -> "Target":
-        """Return the batch elements of an index."""
+    intrinsics: Float[Tensor, "B 4"] | None = None
+    """(fx, fy, cx, cy) of each image in place of the camera's, in pixels of this level; they carry gradients."""
+
+    def take(self, index: Tensor | slice) -> "Target":
+        """Return the batch elements of an index or a slice."""
         confidence = None if self.confidence is None else self.confidence[index]
-        return Target(self.camera, self.padded[index], confidence, self.saturation)
+        intrinsics = None if self.intrinsics is None else self.intrinsics[index]
+        return Target(self.camera, self.padded[index], confidence, self.saturation, intrinsics)
+
+    def k(self, axes: int) -> Intrinsics | None:
+        """Return `intrinsics` ready to broadcast with points of `axes` axes after the batch's; None without any."""
+        if self.intrinsics is None:
+            return None
+        fx, fy, cx, cy = self.intrinsics.reshape(-1, 4, *[1] * axes).unbind(1)
+        return fx, fy, cx, cy
 
 
 def make_target(
@@ -75,12 +86,13 @@ def make_target(
     camera: Camera,
     confidence: Float[Tensor, "B H W"] | None = None,
     saturation: float | None = None,
+    intrinsics: Float[Tensor, "B 4"] | None = None,
 ) -> Target:
     """Pad target images for look-up; pixels that are not finite must have been replaced, with confidence 0."""
     padded = pad_image(image, camera, 1).contiguous()
     if confidence is not None:
         confidence = pad_image(confidence[:, None], camera, 1).contiguous()
-    return Target(camera, padded, confidence, saturation)
+    return Target(camera, padded, confidence, saturation, intrinsics)
 
 
 def look_up_value(target: Target, ray: Float[Tensor, "3 *points"]) -> Float[Tensor, "*points"]:
@@ -90,7 +102,8 @@ def look_up_value(target: Target, ray: Float[Tensor, "3 *points"]) -> Float[Tens
         target: One image (batch 1) of one channel.
         ray: Rays in the image's camera.
     """
-    u, v = target.camera.pixel_of(*(component.reshape(1, -1) for component in ray))
+    x, y, z = (component.reshape(1, -1) for component in ray)
+    u, v = target.camera.pixel_of(x, y, z)
     return interpolate(target.padded, locate(u, v, target.camera)).value[0, 0].view(ray.shape[1:])
 
 
@@ -150,14 +163,15 @@ def look_up(
     camera = target.camera
     weight = reference.weight
     if not camera.wraps:
-        seen = camera.sees(Y.mT, torch.stack(camera.pixel_of(*Y.unbind(1)), -1), margin=0.5)
+        seen = camera.sees(Y.mT, torch.stack(camera.pixel_of(Y[:, 0], Y[:, 1], Y[:, 2], target.k(1)), -1), margin=0.5)
         if seen is not None:
             # Points out of view stand in as one ahead: behind a pinhole their rays would be of any size.
             Y = torch.where(seen[:, None], Y, Y.new_tensor([0.0, 0.0, 1.0])[:, None])
             weight = weight * seen
     x, y, z = Y.unbind(1)
     inv_scale = camera.scale_of(x, y, z).reciprocal()
-    taps = locate(*camera.pixel_of(x, y, z), camera)
+    u, v = camera.pixel_of(x, y, z, target.k(1))
+    taps = locate(u, v, camera)
     value, g_u, g_v = interpolate(target.padded, taps)
     if target.confidence is not None:
         weight = weight * interpolate(target.confidence, taps).value[:, 0]
@@ -172,7 +186,7 @@ def look_up(
         ray=ray,
         rho=(reference.rho * inv_scale)[:, None],
         inv_scale=inv_scale[:, None],
-        G=camera.covector_of(ray, g_u, g_v),
+        G=camera.covector_of(ray, g_u, g_v, target.k(2)),
         gained=gained,
         residual=value - gained - affine[:, 1:, None],
         weight=each,
@@ -215,3 +229,28 @@ def weight_slope_rows(
     Gx, Gy, Gz = (component * (samples.inv_scale * -factor) for component in samples.G)
     rows = [Gx, Gy, Gz, ty * Gz - tz * Gy, tz * Gx - tx * Gz, tx * Gy - ty * Gx]
     return torch.stack(rows, 1).flatten(2)
+
+
+def row_sums(samples: Samples, pull: Float[Tensor, "B C N"]) -> Float64[Tensor, "B 8"]:
+    """Return the Jacobian's eight columns, each times `pull` and summed over all samples, without building them."""
+    rx, ry, rz = samples.ray
+    Px, Py, Pz = (component * pull for component in samples.G)
+    columns = (
+        samples.rho * Px,
+        samples.rho * Py,
+        samples.rho * Pz,
+        ry * Pz - rz * Py,
+        rz * Px - rx * Pz,
+        rx * Py - ry * Px,
+        -samples.gained * pull,
+        -pull,
+    )
+    return torch.stack([column.sum((1, 2), dtype=torch.float64) for column in columns], -1)
+
+
+def weight_slope_sums(
+    samples: Samples, factor: Float[Tensor, "B C N"], t_tgt_ref: Float[Tensor, "B 3"]
+) -> Float64[Tensor, "B 6"]:
+    """Return the rows of `weight_slope_rows` summed over all samples, without building them."""
+    by_v = torch.stack([(G * (samples.inv_scale * -factor)).sum((1, 2), dtype=torch.float64) for G in samples.G], -1)
+    return torch.cat([by_v, torch.linalg.cross(t_tgt_ref.double(), by_v)], -1)

@@ -5,12 +5,14 @@ Residuals are in intensities of [0, 1] (or in the unit of the features).
 """
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from torchvo360.checks import check_choice, check_finite_number
+from torchvo360.residuals.direct import Reference, Samples, by_rho
 
 LOSSES = ("huber", "student_t", "none")
 
@@ -86,3 +88,33 @@ def depth_variance_weight(
     spread = dI_drho * variance
     total = torch.addcmul(torch.full_like(spread, floor), dI_drho, spread)
     return floor / total, spread / total
+
+
+class Weighed(NamedTuple):
+    """How samples count, besides their own weights."""
+
+    weight: Float[Tensor, "B C N"]
+    """Of the robust loss, times that of the uncertain range."""
+    cost: Float[Tensor, "B C N"]
+    slope: Float[Tensor, "B C N"] | None
+    """The range weight's logarithmic slope (`depth_variance_weight`); None where ranges are exact."""
+
+
+def weigh(
+    samples: Samples, reference: Reference, t_tgt_ref: Float[Tensor, "B 3"], loss: LossConfig, noise: float
+) -> Weighed:
+    """Return the robust weights and costs of samples, by the variance of their inverse ranges where there is one.
+
+    Args:
+        samples: Warped points.
+        reference: The points they came from.
+        t_tgt_ref: Translations of the pairs, metres.
+        loss: The robust loss; of residuals that uncertain ranges have been taken out of.
+        noise: Standard deviation of an intensity.
+    """
+    if reference.variance is None:
+        weight, cost = robust(samples.residual, loss)
+        return Weighed(weight, cost, None)
+    by_depth, slope = depth_variance_weight(by_rho(samples, t_tgt_ref), reference.variance[:, None], noise)
+    weight, cost = robust(samples.residual * by_depth.sqrt(), loss)
+    return Weighed(weight * by_depth, cost, slope)

@@ -1,7 +1,26 @@
 """Least squares: it knows no image and no camera."""
 
+from torchvo360.solve.config import LMConfig
+from torchvo360.solve.implicit import Stationarity, attach_implicit, attach_newton_step
 from torchvo360.solve.linear import inverse_ldl, solve_ldl
-from torchvo360.solve.lm import LMConfig, Solution, minimize
+from torchvo360.solve.lm import Solution, minimize
 from torchvo360.solve.status import Status
+from torchvo360.solve.step import Problem, State
+from torchvo360.solve.trace import Trace, last_moves, replay
 
-__all__ = ["LMConfig", "Solution", "Status", "inverse_ldl", "minimize", "solve_ldl"]
+__all__ = [
+    "LMConfig",
+    "Problem",
+    "Solution",
+    "State",
+    "Stationarity",
+    "Status",
+    "Trace",
+    "attach_implicit",
+    "attach_newton_step",
+    "inverse_ldl",
+    "last_moves",
+    "minimize",
+    "replay",
+    "solve_ldl",
+]

@@ -12,6 +12,7 @@ class Status(IntEnum):
     SINGULAR = 3
     TOO_FEW_PIXELS = 4
     DIVERGED = 5
+    BAD_START = 6
 
     @property
     def sentence(self) -> str:
@@ -26,4 +27,5 @@ _SENTENCES = {
     Status.SINGULAR: "The pixels do not determine all parameters, for instance for want of texture.",
     Status.TOO_FEW_PIXELS: "Too few pixels are known, finite, unmasked and in view.",
     Status.DIVERGED: "The images do not agree at the end: a wrong minimum, or a cost that is not finite.",
+    Status.BAD_START: "The start is no rigid motion, not finite or absurdly far away.",
 }

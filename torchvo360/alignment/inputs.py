@@ -1,0 +1,209 @@
+"""What `align` is given: checked, flattened to one batch axis, and rid of numbers that cannot be used."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float, Float64
+from torch import Tensor
+
+from torchvo360.cameras import Camera
+from torchvo360.checks import InputError, check_same_device, check_shape, is_pose
+
+MAX_TRANSLATION = 1e6
+"""Starts farther away than this, m, are no start of anything."""
+
+MAX_RHO = 1e9
+"""Inverse ranges above this, 1/m, are no range of anything; their squares would overflow in float32."""
+
+Maps = Tensor | Sequence[Tensor]
+"""Maps of the camera's size, or a pyramid of one's own, the finest first."""
+
+
+@dataclass(frozen=True)
+class Inputs:
+    """A batch of pairs along one axis; every tensor is finite."""
+
+    ref: list[Float[Tensor, "B C h w"]]
+    """One map, or the levels of a pyramid; zero where not finite."""
+    tgt: list[Float[Tensor, "B C h w"]]
+    ref_finite: list[Bool[Tensor, "B h w"]]
+    tgt_finite: list[Bool[Tensor, "B h w"]]
+    weight_ref: list[Float[Tensor, "B h w"]] | None
+    """Between 0 and 1."""
+    weight_tgt: list[Float[Tensor, "B h w"]] | None
+    rho: Float[Tensor, "B H W"]
+    known: Bool[Tensor, "B H W"]
+    """Pixels of the reference whose inverse range may be used."""
+    variance: Float[Tensor, "B H W"] | None
+    T_tgt_ref: Float64[Tensor, "B 4 4"]
+    started: Bool[Tensor, "B"]
+    """Whether the start is one."""
+    intrinsics: Float64[Tensor, "B 4"] | None
+    batch: torch.Size
+    is_pyramid: bool
+    """Whether the maps are a pyramid of the caller's."""
+
+
+def read_inputs(
+    ref: Maps,
+    tgt: Maps,
+    rho: Tensor,
+    camera: Camera,
+    T_tgt_ref: Tensor | None,
+    mask: Tensor | None,
+    weight_ref: Maps | None,
+    weight_tgt: Maps | None,
+    rho_variance: Tensor | None,
+    intrinsics: Tensor | None,
+) -> Inputs:
+    """Check and flatten what `align` takes.
+
+    Raises:
+        ShapeError: The shapes do not fit each other or the camera.
+        InputError: As `align` says.
+    """
+    refs, tgts = _as_list(ref), _as_list(tgt)
+    refs_weight, tgts_weight = (None if value is None else _as_list(value) for value in (weight_ref, weight_tgt))
+    is_pyramid = isinstance(ref, (list, tuple))
+    _check(refs, tgts, rho, camera, refs_weight, tgts_weight, is_pyramid=is_pyramid)
+    batch = rho.shape[:-2]
+    _check_rest(batch, rho, T_tgt_ref, mask, rho_variance, intrinsics)
+    check_same_device(ref=refs[0], tgt=tgts[0], rho=rho, mask=mask, T_tgt_ref=T_tgt_ref, intrinsics=intrinsics)
+
+    B, dtype = math.prod(batch), refs[0].dtype
+    flat_ref, ref_finite = _finite_maps(refs, B, dtype)
+    flat_tgt, tgt_finite = _finite_maps(tgts, B, dtype)
+    flat_rho = rho.reshape(B, *rho.shape[-2:]).to(dtype)
+    known = (flat_rho >= 0) & (flat_rho <= MAX_RHO)
+    if mask is not None:
+        known = known & mask.reshape(flat_rho.shape).bool()
+    variance = None
+    if rho_variance is not None:
+        variance = rho_variance.reshape(flat_rho.shape).to(dtype)
+        sound = (variance >= 0) & torch.isfinite(variance)
+        known, variance = known & sound, torch.where(sound, variance, 0.0)
+    T, started = _starts(T_tgt_ref, B, rho.device)
+    k, calibrated = _calibrations(intrinsics, camera, B)
+    usable = started if calibrated is None else started & calibrated
+    known = known & usable[:, None, None]
+    return Inputs(
+        ref=flat_ref,
+        tgt=flat_tgt,
+        ref_finite=ref_finite,
+        tgt_finite=tgt_finite,
+        weight_ref=_weights(refs_weight, B, dtype),
+        weight_tgt=_weights(tgts_weight, B, dtype),
+        rho=torch.where(known, flat_rho, 0.0),
+        known=known,
+        variance=variance,
+        T_tgt_ref=T,
+        started=started,
+        intrinsics=k,
+        batch=batch,
+        is_pyramid=is_pyramid,
+    )
+
+
+def _as_list(maps: Maps) -> list[Tensor]:
+    return list(maps) if isinstance(maps, (list, tuple)) else [maps]  # pyright: ignore[reportReturnType]
+
+
+def _check(
+    ref: list[Tensor],
+    tgt: list[Tensor],
+    rho: Tensor,
+    camera: Camera,
+    weight_ref: list[Tensor] | None,
+    weight_tgt: list[Tensor] | None,
+    *,
+    is_pyramid: bool,
+) -> None:
+    """Hold maps and weights to one batch and to their levels' sizes."""
+    if not ref:
+        raise InputError("ref: expected at least one level, got none.")
+    last = (camera.height, camera.width)
+    own = "C h w" if is_pyramid else f"C {last[0]} {last[1]}"
+    check_shape("ref[0]" if is_pyramid else "ref", ref[0], f"... {own}")
+    batch = " ".join(str(size) for size in ref[0].shape[:-3])
+    check_shape("rho", rho, f"{batch} {last[0]} {last[1]}")
+    for level, image in enumerate(ref):
+        name = f"ref[{level}]" if is_pyramid else "ref"
+        sizes = check_shape(name, image, f"{batch} {own}")
+        size = (sizes["h"], sizes["w"]) if is_pyramid else last
+        if sizes["C"] < 1:
+            raise InputError(f"{name}: expected at least one channel, got none.")
+        if min(size) < 1 or size[0] > last[0] or size[1] > last[1]:
+            raise InputError(f"{name}: expected a size of at most {last[0]} x {last[1]}, got {size[0]} x {size[1]}.")
+        if camera.wraps and size[1] % 2:
+            what = name if is_pyramid else "camera"
+            raise InputError(f"{what}: expected an even width for a full panorama, got {size[1]}.")
+        last = size
+    for name, maps in (("tgt", tgt), ("weight_ref", weight_ref), ("weight_tgt", weight_tgt)):
+        if maps is None:
+            continue
+        if len(maps) != len(ref):
+            raise InputError(f"{name}: expected {len(ref)} levels, as ref has, got {len(maps)}.")
+        for level, (value, like) in enumerate(zip(maps, ref, strict=True)):
+            shape = like.shape if name == "tgt" else (*like.shape[:-3], *like.shape[-2:])
+            check_shape(f"{name}[{level}]" if is_pyramid else name, value, " ".join(str(size) for size in shape))
+    for name, value in (("ref", ref[0]), ("tgt", tgt[0]), ("rho", rho)):
+        if value.dtype not in (torch.float32, torch.float64):
+            raise InputError(f"{name}: expected float32 or float64, got {value.dtype}.")
+
+
+def _check_rest(
+    batch: torch.Size,
+    rho: Tensor,
+    T_tgt_ref: Tensor | None,
+    mask: Tensor | None,
+    rho_variance: Tensor | None,
+    intrinsics: Tensor | None,
+) -> None:
+    for name, value, shape in (
+        ("mask", mask, rho.shape),
+        ("rho_variance", rho_variance, rho.shape),
+        ("T_tgt_ref", T_tgt_ref, (*batch, 4, 4)),
+        ("intrinsics", intrinsics, (*batch, 4)),
+    ):
+        if value is not None:
+            check_shape(name, value, " ".join(str(size) for size in shape))
+
+
+def _finite_maps(maps: list[Tensor], B: int, dtype: torch.dtype) -> tuple[list[Tensor], list[Tensor]]:
+    """Return the maps with zeros in place of what is not finite, and where all of their channels are."""
+    flat = [value.reshape(B, *value.shape[-3:]).to(dtype) for value in maps]
+    finite = [torch.isfinite(value) for value in flat]
+    clean = [torch.where(good, value, 0.0) for good, value in zip(finite, flat, strict=True)]
+    return clean, [good.all(1) for good in finite]
+
+
+def _weights(maps: list[Tensor] | None, B: int, dtype: torch.dtype) -> list[Tensor] | None:
+    """Return weights of at most 1 in every image, and 0 in place of what is none: only ratios count."""
+    if maps is None:
+        return None
+    flat = [value.reshape(B, *value.shape[-2:]).double() for value in maps]
+    clean = [torch.where((value >= 0) & torch.isfinite(value), value, 0.0) for value in flat]
+    tiny = torch.finfo(torch.float64).tiny
+    return [(value / value.detach().amax((1, 2), keepdim=True).clamp_min(tiny)).to(dtype) for value in clean]
+
+
+def _starts(T_tgt_ref: Tensor | None, B: int, device: torch.device) -> tuple[Tensor, Tensor]:
+    """Return starts, with the identity in place of what is none, and which are some."""
+    eye = torch.eye(4, dtype=torch.float64, device=device).repeat(B, 1, 1)
+    if T_tgt_ref is None:
+        return eye, torch.ones(B, dtype=torch.bool, device=device)
+    T = T_tgt_ref.reshape(B, 4, 4).double()
+    started = is_pose(T) & (T[:, :3, 3].abs() < MAX_TRANSLATION).all(-1)
+    return torch.where(started[:, None, None], T, eye), started
+
+
+def _calibrations(intrinsics: Tensor | None, camera: Camera, B: int) -> tuple[Tensor | None, Tensor | None]:
+    """Return intrinsics, with the camera's own in place of impossible ones, and which are possible."""
+    if intrinsics is None:
+        return None, None
+    k = intrinsics.reshape(B, 4).double()
+    sound = torch.isfinite(k).all(-1) & (k[:, :2] != 0).all(-1)
+    own = torch.tensor(camera.intrinsics, dtype=torch.float64, device=k.device)
+    return torch.where(sound[:, None], k, own), sound

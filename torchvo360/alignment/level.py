@@ -1,0 +1,114 @@
+"""Alignment at one resolution: where to start the brightness, and the solve."""
+
+import math
+from dataclasses import replace
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from torchvo360 import lie
+from torchvo360.alignment.config import AlignConfig
+from torchvo360.backends import linearize
+from torchvo360.residuals.direct import Reference, Target
+from torchvo360.residuals.normal import NormalEquations
+from torchvo360.solve import Problem, Solution, minimize
+
+
+def match_brightness(reference: Reference, target: Target) -> Float[Tensor, "B 2"]:
+    """Return (a, b) that give the reference's values the target's mean and spread, over all that is usable.
+
+    It needs no pose: where the same scene fills both images it is close, and exposure jumps of several stops are
+    bridged before the first step. The gain is held within a factor of five.
+    """
+    padded = target.padded[..., 1:-1, 1:-1].double()
+    ones = torch.ones_like(padded[:, :1])
+    confidence = ones if target.confidence is None else target.confidence[..., 1:-1, 1:-1].double()
+    camera = target.camera
+    area = camera.solid_angle(camera.pixel_grid(dtype=torch.float64, device=padded.device))
+
+    def moments(value: Tensor, weight: Tensor) -> tuple[Tensor, Tensor]:
+        total = weight.sum((1, 2)).clamp_min(1e-12)
+        mean = (value.mean(1, keepdim=True) * weight).sum((1, 2)) / total
+        variance = (((value.mean(1, keepdim=True) - mean[:, None, None]) ** 2) * weight).sum((1, 2)) / total
+        # The floor keeps the root's slope finite where an image has no contrast.
+        return mean, (variance + 1e-16).sqrt()
+
+    mean_tgt, spread_tgt = moments(padded.flatten(2), (confidence * area).flatten(2))
+    mean_ref, spread_ref = moments(reference.value.double(), reference.weight.double()[:, None])
+    a = ((spread_tgt + 1e-4) / (spread_ref + 1e-4)).log().clamp(-math.log(5), math.log(5))
+    return torch.stack([a, mean_tgt - a.exp() * mean_ref], -1)
+
+
+def retract(state: tuple[Tensor, ...], delta: Float[Tensor, "B 8"]) -> tuple[Tensor, ...]:
+    """Apply steps (v, w, a, b) to poses and brightness."""
+    T_tgt_ref, affine = state
+    return lie.se3_exp(delta[:, :6]) @ T_tgt_ref, affine + delta[:, 6:]
+
+
+def free_parameters(config: AlignConfig, device: torch.device) -> Bool[Tensor, "8"]:
+    """Return which of (v, w, a, b) are estimated."""
+    return torch.arange(8, device=device) < (8 if config.affine else 6)
+
+
+def level_problem(reference: Reference, target: Target, config: AlignConfig, free: Bool[Tensor, "8"]) -> Problem:
+    """Return the least-squares problem of one pyramid level."""
+    B = target.padded.shape[0]
+
+    def evaluate(state: tuple[Tensor, ...], index: Tensor) -> NormalEquations:
+        T, affine = state
+        whole = index.numel() == B
+        points, images = (reference, target) if whole else (reference.take(index), target.take(index))
+        return linearize(points, images, T, affine, config.loss, noise=config.noise)
+
+    return Problem(evaluate, retract, free)
+
+
+def solve_level(
+    reference: Reference,
+    target: Target,
+    T_tgt_ref: Float[Tensor, "B 4 4"],
+    affine: Float[Tensor, "B 2"],
+    config: AlignConfig,
+    *,
+    max_steps: int,
+    free: Bool[Tensor, "8"] | None = None,
+    traced: bool = False,
+) -> Solution:
+    """Align at one resolution from given poses and brightness.
+
+    Args:
+        reference: Points.
+        target: Images of one pyramid level.
+        T_tgt_ref: Starts, float64.
+        affine: (a, b) to start from, float64.
+        config: Settings; of the solver's, `max_steps` is replaced.
+        max_steps: Most steps.
+        free: Which of (v, w, a, b) are estimated; all, or all but (a, b), by `config.affine` when it is None.
+        traced: Whether every step is noted.
+    """
+    B = T_tgt_ref.shape[0]
+    problem = level_problem(
+        reference, target, config, free_parameters(config, T_tgt_ref.device) if free is None else free
+    )
+    per_radian = 1 / target.camera.pixel_angle
+    weight = reference.weight.double()
+    mean_rho = (reference.rho.double() * weight).sum(1) / weight.sum(1).clamp_min(1e-12)
+    scale = torch.cat(
+        [
+            (mean_rho * per_radian)[:, None].expand(B, 3),
+            torch.full_like(mean_rho, per_radian)[:, None].expand(B, 3),
+            torch.ones_like(mean_rho)[:, None].expand(B, 2),
+        ],
+        -1,
+    )
+    return minimize(
+        problem.linearize,
+        problem.retract,
+        (T_tgt_ref, affine),
+        replace(config.solver, max_steps=max_steps),
+        step_scale=scale,
+        free=problem.free,
+        min_weight=config.min_pixels,
+        traced=traced,
+    )

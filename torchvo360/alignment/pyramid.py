@@ -1,0 +1,151 @@
+"""From images, ranges and weights to the points and targets of every pyramid level."""
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool
+from torch import Tensor
+
+from torchvo360.alignment.config import AlignConfig
+from torchvo360.alignment.inputs import Inputs
+from torchvo360.cameras import Camera
+from torchvo360.image import blur, level_camera, resample
+from torchvo360.residuals.direct import Reference, Target, make_target
+
+
+@dataclass(frozen=True)
+class Level:
+    """One resolution of a batch of pairs."""
+
+    reference: Reference
+    target: Target
+
+
+@dataclass(frozen=True)
+class _Maps:
+    """What a level is made of, before it is laid out for the kernel."""
+
+    camera: Camera
+    ref: Tensor
+    tgt: Tensor
+    rho: Tensor
+    variance: Tensor | None
+    known: Tensor
+    weight: Tensor | None
+    confidence: Tensor | None
+
+
+def build_levels(inputs: Inputs, camera: Camera, config: AlignConfig) -> list[Level]:
+    """Build every level's points and target, the finest first.
+
+    Where not all steps are to be differentiated, the levels beyond `config.finest` carry no gradient.
+    """
+    branches = not config.solver.fixed_steps
+    if inputs.is_pyramid:
+        maps = _given_levels(inputs, camera, branches=branches)
+    else:
+        maps = _own_levels(inputs, camera, config, branches=branches)
+    saturation = config.saturation if inputs.ref[0].shape[1] == 1 and not inputs.is_pyramid else None
+    finest = 0 if inputs.is_pyramid else config.finest
+    levels = []
+    for number, each in enumerate(maps):
+        with torch.set_grad_enabled(torch.is_grad_enabled() and (config.backward == "unroll" or number <= finest)):
+            levels.append(_laid_out(each, inputs.intrinsics, camera, saturation))
+    return levels
+
+
+def _own_levels(inputs: Inputs, camera: Camera, config: AlignConfig, *, branches: bool) -> list[_Maps]:
+    """Smooth and halve the one map that is given."""
+    ref, tgt = inputs.ref[0], inputs.tgt[0]
+    known = inputs.known & _eroded(inputs.ref_finite[0], camera, branches=branches)
+    if config.saturation is not None and ref.shape[1] == 1:
+        known = known & (ref[:, 0] < config.saturation)
+    confidence = _confidence(inputs, 0, camera, branches=branches)
+    weight = None if inputs.weight_ref is None else inputs.weight_ref[0]
+    ref, tgt = blur(ref, camera, config.blur_px), blur(tgt, camera, config.blur_px)
+    ranges = _Ranges(inputs, known)
+    levels = [_Maps(camera, ref, tgt, *ranges.at(camera), weight, confidence)]
+    for level in range(1, config.level_count(camera)):
+        at = level_camera(camera, level)
+        ref, tgt = resample(ref, at), resample(tgt, at)
+        confidence, weight = (None if x is None else resample(x, at) for x in (confidence, weight))
+        levels.append(_Maps(at, ref, tgt, *ranges.at(at), weight, confidence))
+    return levels
+
+
+def _given_levels(inputs: Inputs, camera: Camera, *, branches: bool) -> list[_Maps]:
+    """Take a pyramid as it is; only the ranges are brought to its sizes."""
+    ranges = _Ranges(inputs, inputs.known)
+    levels = []
+    for number, (ref, tgt) in enumerate(zip(inputs.ref, inputs.tgt, strict=True)):
+        at = camera.resized(ref.shape[-1], ref.shape[-2])
+        rho, variance, known = ranges.at(at)
+        confidence = _confidence(inputs, number, at, branches=branches)
+        weight = None if inputs.weight_ref is None else inputs.weight_ref[number]
+        levels.append(_Maps(at, ref, tgt, rho, variance, known & inputs.ref_finite[number], weight, confidence))
+    return levels
+
+
+class _Ranges:
+    """Inverse ranges, from level to level: means of what is known, known where at least half of the area is."""
+
+    def __init__(self, inputs: Inputs, known: Bool[Tensor, "B H W"]) -> None:
+        self._share = known.to(inputs.rho.dtype)
+        self._total = inputs.rho * self._share
+        self._spread = None if inputs.variance is None else inputs.variance * self._share
+
+    def at(self, camera: Camera) -> tuple[Tensor, Tensor | None, Tensor]:
+        """Return the inverse ranges, their variances and where they are known, at a size below the last one's.
+
+        Errors of neighbouring ranges go together: their mean is no surer than they are.
+        """
+        self._share, self._total = resample(self._share, camera), resample(self._total, camera)
+        share = self._share.clamp_min(1e-6)
+        variance = None
+        if self._spread is not None:
+            self._spread = resample(self._spread, camera)
+            variance = self._spread / share
+        return self._total / share, variance, self._share >= 0.5
+
+
+def _laid_out(maps: _Maps, intrinsics: Tensor | None, whole: Camera, saturation: float | None) -> Level:
+    camera, dtype, device = maps.camera, maps.ref.dtype, maps.ref.device
+    area = camera.solid_angle(camera.pixel_grid(dtype=dtype, device=device))
+    each = maps.known * (area / area.mean())
+    if maps.weight is not None:
+        each = each * maps.weight
+    k = None
+    if intrinsics is None:
+        ray = camera.ray_grid(dtype=dtype, device=device)[None]
+    else:
+        size = intrinsics.new_tensor([camera.width / whole.width, camera.height / whole.height] * 2)
+        k = intrinsics * size
+        fx, fy, cx, cy = k[:, :, None, None].unbind(1)
+        ray = camera.ray(camera.pixel_grid(dtype=torch.float64, device=device), (fx, fy, cx, cy)).to(dtype)
+        k = k.to(dtype)
+    reference = Reference(
+        ray=ray.permute(0, 3, 1, 2).flatten(2).contiguous(),
+        rho=maps.rho.flatten(1).contiguous(),
+        value=maps.ref.flatten(2).contiguous(),
+        weight=each.flatten(1).contiguous(),
+        variance=None if maps.variance is None else maps.variance.flatten(1).contiguous(),
+    )
+    return Level(reference, make_target(maps.tgt, camera, maps.confidence, saturation, k))
+
+
+def _confidence(inputs: Inputs, number: int, camera: Camera, *, branches: bool) -> Tensor | None:
+    """Return the weight of each pixel of the target; None where all count fully."""
+    weight = None if inputs.weight_tgt is None else inputs.weight_tgt[number]
+    finite = inputs.tgt_finite[number]
+    if branches and bool(finite.all()):
+        return weight
+    usable = _eroded(finite, camera, branches=branches).to(inputs.tgt[number].dtype)
+    return usable if weight is None else usable * weight
+
+
+def _eroded(usable: Bool[Tensor, "B H W"], camera: Camera, *, branches: bool) -> Bool[Tensor, "B H W"]:
+    """Drop the pixels beside unusable ones, whose values interpolation and smoothing would mix in."""
+    if branches and bool(usable.all()):
+        return usable
+    spoiled = blur((~usable).to(torch.float32), camera, 0.5) > 0
+    return ~spoiled

@@ -10,7 +10,7 @@ from torch import Tensor
 from torchvo360.alignment.config import AlignConfig
 from torchvo360.alignment.level import level_problem, retract
 from torchvo360.alignment.pyramid import Level
-from torchvo360.backends import gradient, linearize
+from torchvo360.backends import OpenLinearization
 from torchvo360.residuals.direct import Reference, Target
 from torchvo360.solve import (
     Solution,
@@ -34,17 +34,13 @@ def attach_solution(
         values = iter(parameters)
         return _refilled(level.reference, values), _refilled(level.target, values)
 
-    def stationary(state: State, parameters: tuple[Tensor, ...]) -> Tensor:
+    def opened(state: State, parameters: tuple[Tensor, ...]) -> OpenLinearization:
         (reference, target), (T, affine) = rebuilt(parameters), state
-        return gradient(reference, target, T, affine, config.loss, noise=config.noise)
-
-    def normal_matrix(state: State, parameters: tuple[Tensor, ...]) -> Tensor:
-        (reference, target), (T, affine) = rebuilt(parameters), state
-        return linearize(reference, target, T, affine, config.loss, noise=config.noise).H
+        return OpenLinearization.at(reference, target, T, affine, config.loss, config.noise)
 
     problem = Stationarity(
-        gradient=stationary,
-        normal_matrix=normal_matrix,
+        gradient=lambda state, parameters: opened(state, parameters).gradient(),
+        linearize=opened,
         retract=retract,
         free=free,
         where=converged,

@@ -1,5 +1,6 @@
-"""The hot kernel: `linearize`, one signature for every backend, and `gradient` for what differentiates it."""
+"""The hot kernel: `linearize`, one signature for every backend, and `OpenLinearization` for what differentiates it."""
 
-from torchvo360.backends.eager import gradient, linearize
+from torchvo360.backends.derivative import OpenLinearization
+from torchvo360.backends.eager import linearize
 
-__all__ = ["gradient", "linearize"]
+__all__ = ["OpenLinearization", "linearize"]

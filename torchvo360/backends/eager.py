@@ -13,15 +13,14 @@ from torch import Tensor
 
 from torchvo360.residuals.direct import (
     Reference,
+    Samples,
     Target,
     look_up,
-    row_sums,
     system_rows,
     weight_slope_rows,
-    weight_slope_sums,
 )
 from torchvo360.residuals.normal import NormalEquations
-from torchvo360.residuals.weights import LossConfig, weigh
+from torchvo360.residuals.weights import LossConfig, Weighed, weigh
 
 CHUNK_SAMPLES = 49152
 """Samples in one go; measured fastest between 32768 and 65536 on a core with 1 MB of L2 cache."""
@@ -56,42 +55,13 @@ def linearize(
         for points, images, T, ab in chunks:
             samples = look_up(points, images, T, ab)
             weighed = weigh(samples, points, T[:, :3, 3], loss, noise)
-            S = system_rows(samples, _root(samples.weight * weighed.weight))
-            if weighed.slope is not None:
-                factor = weighed.slope * samples.residual * _root(samples.weight * weighed.weight)
-                S[:, :6] += weight_slope_rows(samples, factor, T[:, :3, 3])
+            S = weighted_rows(samples, weighed, T[:, :3, 3])
             cost = (samples.weight * weighed.cost).sum((1, 2)).double()
             weight = samples.weight.sum((1, 2)).double() * (C / samples.weight.shape[1])
-            parts.append((_gram(S), cost, weight))
+            parts.append((gram(S), cost, weight))
         groups.append([torch.stack(column).sum(0) for column in zip(*parts, strict=True)])
     M, cost, total = (torch.cat(column) for column in zip(*groups, strict=True))
     return NormalEquations(M[:, :8, :8], M[:, :8, 8], cost, total, M[:, 8, 8])
-
-
-def gradient(
-    reference: Reference,
-    target: Target,
-    T_tgt_ref: Float[Tensor, "B 4 4"],
-    affine: Float[Tensor, "B 2"],
-    loss: LossConfig,
-    *,
-    noise: float = 4 / 255,
-) -> Float64[Tensor, "B 8"]:
-    """Return only the `g` of `linearize`, in a form that is cheap to differentiate: no rows, two passes over G."""
-    groups = []
-    for chunks in _divided(reference, target, T_tgt_ref, affine):
-        parts = []
-        for points, images, T, ab in chunks:
-            samples = look_up(points, images, T, ab)
-            weighed = weigh(samples, points, T[:, :3, 3], loss, noise)
-            pull = samples.weight * weighed.weight * samples.residual
-            part = row_sums(samples, pull)
-            if weighed.slope is not None:
-                slope_part = weight_slope_sums(samples, weighed.slope * samples.residual * pull, T[:, :3, 3])
-                part = torch.cat([part[:, :6] + slope_part, part[:, 6:]], -1)
-            parts.append(part)
-        groups.append(torch.stack(parts).sum(0))
-    return torch.cat(groups)
 
 
 Part = tuple[Reference, Target, Tensor, Tensor]
@@ -116,7 +86,16 @@ def _divided(reference: Reference, target: Target, T_tgt_ref: Tensor, affine: Te
         yield chunks(slice(first, first + group))
 
 
-def _gram(S: Float[Tensor, "B 9 M"]) -> Float64[Tensor, "B 9 9"]:
+def weighted_rows(samples: Samples, weighed: Weighed, t_tgt_ref: Float[Tensor, "B 3"]) -> Float[Tensor, "B 9 M"]:
+    """Return the Jacobian's eight columns and the residual, all times the roots of their weights."""
+    root = _root(samples.weight * weighed.weight)
+    S = system_rows(samples, root)
+    if weighed.slope is not None:
+        S[:, :6] += weight_slope_rows(samples, weighed.slope * samples.residual * root, t_tgt_ref)
+    return S
+
+
+def gram(S: Float[Tensor, "B 9 M"]) -> Float64[Tensor, "B 9 9"]:
     """Return `S S^T`, summed block by block."""
     blocks = S.shape[2] // SUM_SAMPLES
     if blocks < 2 or not len(S):

@@ -254,3 +254,22 @@ def weight_slope_sums(
     """Return the rows of `weight_slope_rows` summed over all samples, without building them."""
     by_v = torch.stack([(G * (samples.inv_scale * -factor)).sum((1, 2), dtype=torch.float64) for G in samples.G], -1)
     return torch.cat([by_v, torch.linalg.cross(t_tgt_ref.double(), by_v)], -1)
+
+
+def along(samples: Samples, direction: Float[Tensor, "B 8"]) -> Float[Tensor, "B C N"]:
+    """Return the residuals' derivative along a direction (v, w, a, b), without building rows."""
+    v1, v2, v3, w1, w2, w3, a, b = direction[..., None, None].unbind(1)
+    rx, ry, rz = samples.ray
+    Gx, Gy, Gz = samples.G
+    moved_x = samples.rho * v1 + (w2 * rz - w3 * ry)
+    moved_y = samples.rho * v2 + (w3 * rx - w1 * rz)
+    moved_z = samples.rho * v3 + (w1 * ry - w2 * rx)
+    return Gx * moved_x + Gy * moved_y + Gz * moved_z - samples.gained * a - b
+
+
+def slope_along(
+    samples: Samples, direction: Float[Tensor, "B 8"], t_tgt_ref: Float[Tensor, "B 3"]
+) -> Float[Tensor, "B C N"]:
+    """Return the derivative of dI/drho along a direction, with G and s held, as `weight_slope_rows` does."""
+    moved = direction[:, :3] + torch.linalg.cross(direction[:, 3:6], t_tgt_ref)
+    return by_rho(samples, moved)

@@ -6,7 +6,7 @@ At the solution x the gradient of the cost vanishes, `g(x, theta) = 0`, so that 
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Protocol
 
 import torch
 from jaxtyping import Bool, Float
@@ -19,13 +19,24 @@ Parameters = tuple[Tensor, ...]
 """All tensors that the cost depends on besides the state."""
 
 
+class Linearization(Protocol):
+    """A linearisation that is kept open, for two questions about it."""
+
+    def matrix(self) -> Float[Tensor, "B D D"]:
+        """Return J^T W J."""
+        ...
+
+    def pull(self, direction: Float[Tensor, "B D"]) -> Float[Tensor, "B"]:
+        """Return g along a direction."""
+        ...
+
+
 @dataclass(frozen=True)
 class Stationarity:
     """What holds at a solution, as functions of the state and the parameters; elements do not depend on each other."""
 
     gradient: Callable[[State, Parameters], Float[Tensor, "B D"]]
-    normal_matrix: Callable[[State, Parameters], Float[Tensor, "B D D"]]
-    """J^T W J."""
+    linearize: Callable[[State, Parameters], Linearization]
     retract: Callable[[State, Float[Tensor, "B D"]], State]
     free: Bool[Tensor, "D"]
     where: Bool[Tensor, "B"]
@@ -33,27 +44,21 @@ class Stationarity:
     exact: bool
     """Whether H is the exact Hessian."""
 
-    def matrix(self, state: State, parameters: Parameters, *, create_graph: bool) -> Float[Tensor, "B D D"]:
-        """Return H, with the identity in place of what is not free, and for elements that are not solutions."""
-        if self.exact:
-            H = self._hessian(state, parameters, create_graph=create_graph)
-        else:
-            H = self.normal_matrix(state, parameters)
+    def completed(self, H: Float[Tensor, "B D D"]) -> Float[Tensor, "B D D"]:
+        """Return H with the identity in place of what is not free, and for elements that are not solutions."""
         use = self.free[:, None] & self.free & self.where[:, None, None]
         eye = torch.eye(H.shape[-1], dtype=H.dtype, device=H.device)
-        kept = torch.where(use, H, 0.0)
-        return kept + eye * ~use.diagonal(dim1=-2, dim2=-1)[:, None]
+        return torch.where(use, H, 0.0) + eye * ~use.diagonal(dim1=-2, dim2=-1)[:, None]
 
-    def _hessian(self, state: State, parameters: Parameters, *, create_graph: bool) -> Float[Tensor, "B D D"]:
-        with torch.enable_grad():
-            zero = torch.zeros(*self.where.shape, len(self.free), dtype=state[0].dtype, device=state[0].device)
-            delta = zero.requires_grad_()
-            g = self.gradient(self.retract(state, delta), parameters)
+    def hessian(self, state: State, parameters: Parameters) -> Float[Tensor, "B D D"]:
+        """Return the exact dg / dx."""
+
+        def total(delta: Tensor) -> Tensor:
             # Elements are independent: the sum over them has every element's row.
-            sums = g.sum(0).unbind()
-            rows = [torch.autograd.grad(x, delta, retain_graph=True, create_graph=create_graph)[0] for x in sums]
-            H = torch.stack(rows, 1)
-        return H if create_graph else H.detach()
+            return self.gradient(self.retract(state, delta), parameters).sum(0)
+
+        zero = torch.zeros(*self.where.shape, len(self.free), dtype=state[0].dtype, device=state[0].device)
+        return torch.func.jacrev(total, chunk_size=1)(zero).transpose(0, 1)  # pyright: ignore[reportAttributeAccessIssue]
 
     def solve_transposed(self, H: Float[Tensor, "B D D"], b: Float[Tensor, "B D"]) -> Float[Tensor, "B D"]:
         """Return `H^-T b`, zero where H cannot be inverted."""
@@ -89,7 +94,9 @@ def attach_newton_step(problem: Stationarity, solution: State, parameters: Param
     state = tuple(part.detach() for part in solution)
     constant = tuple(part.detach() for part in parameters)
     with torch.no_grad():
-        H = problem.matrix(state, constant, create_graph=False)
+        exact = problem.exact
+        H = problem.hessian(state, constant) if exact else problem.linearize(state, constant).matrix()
+        H = problem.completed(H)
     g = problem.gradient(state, parameters) * problem.free
     g = torch.where(problem.where[:, None], g - g.detach(), 0.0)
     step = problem.solve_transposed(H.mT, -g)
@@ -124,10 +131,13 @@ class _Implicit(torch.autograd.Function):
             # Elements without a solution are cut off before anything is multiplied with their numbers.
             cut = tuple(torch.where(problem.where.reshape(-1, *[1] * (g.ndim - 1)), g, 0.0) for g in grads)
             (by_delta,) = torch.autograd.grad(problem.retract(state, delta), delta, cut, create_graph=again)
+            at = problem.linearize(state, parameters)
             with torch.set_grad_enabled(again):
-                H = problem.matrix(state, saved[count:], create_graph=again)
-                s = problem.solve_transposed(H, by_delta * problem.free)
-            pull = (problem.gradient(state, parameters) * -s).sum()
+                if problem.exact:
+                    H = problem.hessian(state, saved[count:])
+                else:
+                    H = (problem.linearize(state, saved[count:]) if again else at).matrix()
+                s = problem.solve_transposed(problem.completed(H), by_delta * problem.free)
             chosen = [part for part, want in zip(parameters, wanted, strict=True) if want]
-            found = iter(torch.autograd.grad(pull, chosen, create_graph=again, allow_unused=True))
+            found = iter(torch.autograd.grad(at.pull(-s).sum(), chosen, create_graph=again, allow_unused=True))
         return (None, None, *[None] * count, *(next(found) if want else None for want in wanted))

@@ -112,43 +112,25 @@ def _coarse_to_fine(levels: list[Level], inputs: Inputs, config: AlignConfig, ou
         brightness = match_brightness(levels[-1].reference, levels[-1].target)
     state: State = (inputs.T_tgt_ref, brightness)
     followed = torch.is_grad_enabled() and has_gradient(levels[finest], state, config)
-    history: list[LevelHistory] = []
-
-    def solve(number: int, state: State) -> tuple[Solution, State]:
-        level = levels[number]
-        unrolled = followed and config.backward == "unroll"
-        truncated = followed and config.backward == "truncated" and number == finest
-        T, affine = (part.detach() for part in state)
-        with torch.no_grad():
-            solution = solve_level(
-                level.reference,
-                level.target,
-                T,
-                affine,
-                config,
-                max_steps=config.most_steps(number),
-                traced=unrolled or truncated or "history" in outputs,
-            )
-        found = solution.state
-        if unrolled or truncated:
-            found = attach_steps(
-                level, state, solution, config, free, last=config.backward_steps if truncated else None
-            )
-        if "history" in outputs:
-            history.append(_history(solution, found[0], inputs.batch))
-        return solution, found
-
+    traced = "history" in outputs
     steps = torch.zeros(len(inputs.T_tgt_ref), dtype=torch.int64, device=inputs.rho.device)
+    history: list[LevelHistory] = []
+    unrolled = followed and config.backward == "unroll"
     for number in range(len(levels) - 1, finest, -1):
-        solution, state = solve(number, state)
+        solution, state = _solve(levels[number], number, state, config, unrolled=unrolled, traced=traced)
         steps = steps + solution.steps
-    solution, state = solve(finest, state)
+        if traced:
+            history.append(_history(solution, state[0], inputs.batch))
+    unrolled = unrolled or (followed and config.backward == "truncated")
+    solution, state = _solve(levels[finest], finest, state, config, unrolled=unrolled, traced=traced)
+    if traced:
+        history.append(_history(solution, state[0], inputs.batch))
     status, agreed = _judged(levels[finest], solution, inputs, config)
-    solved = status == Status.CONVERGED
+    solved = status == int(Status.CONVERGED)
     if followed and config.backward == "implicit":
         state = attach_solution(levels[finest], solution.state, solved, config, free)
     elif followed:
-        solved = inputs.started & (status != Status.TOO_FEW_PIXELS)
+        solved = inputs.started & (status != int(Status.TOO_FEW_PIXELS))
     T, affine = state
     equations = solution.equations
     if "information" in outputs:
@@ -170,9 +152,30 @@ def _coarse_to_fine(levels: list[Level], inputs: Inputs, config: AlignConfig, ou
     }
     return AlignResult(
         **{name: value.reshape((*inputs.batch, *value.shape[1:])) for name, value in fields.items()},
-        history=history if "history" in outputs else None,
+        history=history if traced else None,
         maps=_maps(levels[finest], T, affine, config, inputs.batch) if "maps" in outputs else None,
     )
+
+
+def _solve(
+    level: Level, number: int, state: State, config: AlignConfig, *, unrolled: bool, traced: bool
+) -> tuple[Solution, State]:
+    """Return the solve of one level, and its state: with the gradients of its steps where they are unrolled."""
+    T, affine = (part.detach() for part in state)
+    with torch.no_grad():
+        solution = solve_level(
+            level.reference,
+            level.target,
+            T,
+            affine,
+            config,
+            max_steps=config.most_steps(number),
+            traced=traced or unrolled,
+        )
+    if not unrolled:
+        return solution, solution.state
+    last = config.backward_steps if config.backward == "truncated" else None
+    return solution, attach_steps(level, state, solution, config, last=last)
 
 
 @torch.no_grad()
@@ -180,7 +183,7 @@ def _judged(level: Level, solution: Solution, inputs: Inputs, config: AlignConfi
     """Return the final status of every element, and how well its images agree."""
     T, affine = solution.state
     agreed = agreeing_share(level.reference, level.target, T, affine).double().nan_to_num(nan=0.0)
-    false_minimum = (solution.status == Status.CONVERGED) & (agreed < config.min_agreement)
+    false_minimum = (solution.status == int(Status.CONVERGED)) & (agreed < config.min_agreement)
     status = torch.where(false_minimum, int(Status.DIVERGED), solution.status)
     return torch.where(inputs.started, status, int(Status.BAD_START)), agreed
 

@@ -1,5 +1,7 @@
 """Alignment at one resolution: where to start the brightness, and the solve."""
 
+from __future__ import annotations
+
 import math
 from dataclasses import replace
 

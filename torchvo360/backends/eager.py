@@ -5,6 +5,8 @@
 How samples are divided depends on the points alone: a pair gets the same bits whatever else is in its batch.
 """
 
+from __future__ import annotations
+
 from collections.abc import Iterator
 
 import torch

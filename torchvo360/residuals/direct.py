@@ -63,7 +63,6 @@ class Target:
     """Weight of each pixel, looked up like the image; None where all count fully."""
     saturation: float | None = None
     """Values at or above this are clipped by the sensor and weigh nothing."""
-
     intrinsics: Float[Tensor, "B 4"] | None = None
     """(fx, fy, cx, cy) of each image in place of the camera's, in pixels of this level; they carry gradients."""
 
@@ -72,13 +71,6 @@ class Target:
         confidence = None if self.confidence is None else self.confidence[index]
         intrinsics = None if self.intrinsics is None else self.intrinsics[index]
         return Target(self.camera, self.padded[index], confidence, self.saturation, intrinsics)
-
-    def k(self, axes: int) -> Intrinsics | None:
-        """Return `intrinsics` ready to broadcast with points of `axes` axes after the batch's; None without any."""
-        if self.intrinsics is None:
-            return None
-        fx, fy, cx, cy = self.intrinsics.reshape(-1, 4, *[1] * axes).unbind(1)
-        return fx, fy, cx, cy
 
 
 def make_target(
@@ -158,19 +150,22 @@ def look_up(
         T_tgt_ref: Poses, in the dtype of the points.
         affine: (a, b) of each pair.
     """
+    # Aliases: gradients of the several uses are summed here first, in one order whatever part of a batch this is.
+    rho, T_tgt_ref = reference.rho.view_as(reference.rho), T_tgt_ref.view_as(T_tgt_ref)
+    k, k_of_channels = _broadcast(target.intrinsics)
     R, t = T_tgt_ref[:, :3, :3], T_tgt_ref[:, :3, 3:]
-    Y = torch.baddbmm(t * reference.rho[:, None], R, reference.ray.expand(R.shape[0], -1, -1))
+    Y = torch.baddbmm(t * rho[:, None], R, reference.ray.expand(R.shape[0], -1, -1))
     camera = target.camera
     weight = reference.weight
     if not camera.wraps:
-        seen = camera.sees(Y.mT, torch.stack(camera.pixel_of(Y[:, 0], Y[:, 1], Y[:, 2], target.k(1)), -1), margin=0.5)
+        seen = camera.sees(Y.mT, torch.stack(camera.pixel_of(Y[:, 0], Y[:, 1], Y[:, 2], k), -1), margin=0.5)
         if seen is not None:
             # Points out of view stand in as one ahead: behind a pinhole their rays would be of any size.
             Y = torch.where(seen[:, None], Y, Y.new_tensor([0.0, 0.0, 1.0])[:, None])
             weight = weight * seen
     x, y, z = Y.unbind(1)
     inv_scale = camera.scale_of(x, y, z).reciprocal()
-    u, v = camera.pixel_of(x, y, z, target.k(1))
+    u, v = camera.pixel_of(x, y, z, k)
     taps = locate(u, v, camera)
     value, g_u, g_v = interpolate(target.padded, taps)
     if target.confidence is not None:
@@ -184,13 +179,21 @@ def look_up(
     gained = affine[:, :1, None].exp() * reference.value
     return Samples(
         ray=ray,
-        rho=(reference.rho * inv_scale)[:, None],
+        rho=(rho * inv_scale)[:, None],
         inv_scale=inv_scale[:, None],
-        G=camera.covector_of(ray, g_u, g_v, target.k(2)),
+        G=camera.covector_of(ray, g_u, g_v, k_of_channels),
         gained=gained,
         residual=value - gained - affine[:, 1:, None],
         weight=each,
     )
+
+
+def _broadcast(intrinsics: Tensor | None) -> tuple[Intrinsics | None, Intrinsics | None]:
+    """Return intrinsics as they broadcast with [B, N] and with [B, C, N]."""
+    if intrinsics is None:
+        return None, None
+    fx, fy, cx, cy = intrinsics[:, :, None].unbind(1)
+    return (fx, fy, cx, cy), (fx[:, None], fy[:, None], cx[:, None], cy[:, None])
 
 
 def by_rho(samples: Samples, t_tgt_ref: Float[Tensor, "B 3"]) -> Float[Tensor, "B C N"]:

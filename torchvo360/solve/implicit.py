@@ -4,6 +4,8 @@ At the solution x the gradient of the cost vanishes, `g(x, theta) = 0`, so that 
 `H = dg / dx`: undamped, either J^T W J (Gauss-Newton: exact where residuals vanish) or the exact Hessian.
 """
 
+from __future__ import annotations
+
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Protocol

@@ -72,7 +72,7 @@ def attach_steps(
     assert solution.trace is not None
     trace = solution.trace
     if last is not None:
-        start, trace = last_moves(trace, last)
+        start, trace = last_moves(trace, last, solution.state)
     free = free_parameters(config, start[0].device)
     problem = level_problem(level.reference, level.target, config, free)
     again = replay(problem, start, trace, masked=config.solver.fixed_steps)

@@ -67,11 +67,19 @@ class TraceWriter:
         return Trace(stacked, *(torch.stack(rows) for rows in (cost, damping, tried, self._moved)))
 
 
-def last_moves(trace: Trace, count: int) -> tuple[State, Trace]:
-    """Return the last `count` accepted steps of every element, and the states before them."""
+def last_moves(trace: Trace, count: int, end: State) -> tuple[State, Trace]:
+    """Return the states before the last `count` accepted steps of every element, and those steps.
+
+    Args:
+        trace: All steps.
+        count: How many.
+        end: The states after all steps.
+    """
+    if len(trace.moved) == 0:
+        return end, trace
     left = trace.moved.flip(0).cumsum(0).flip(0)
     moved = trace.moved & (left <= count)
-    first = moved.to(torch.int8).argmax(0) if len(moved) else moved.new_zeros(moved.shape[1], dtype=torch.int64)
+    first = moved.to(torch.int8).argmax(0)
     elements = torch.arange(moved.shape[1], device=moved.device)
     return tuple(part[first, elements] for part in trace.state), trace._replace(moved=moved)
 

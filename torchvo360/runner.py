@@ -9,12 +9,15 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
+from pathlib import Path
 from types import FrameType, TracebackType
 
 import cv2
 import torch
+from torch import nn
 from tqdm import tqdm
 
+from torchvo360 import learn
 from torchvo360.checks import InputError
 from torchvo360.data import Frame, ImageSequence, Trajectory
 from torchvo360.data.images import open_images
@@ -22,12 +25,17 @@ from torchvo360.data.masks import parse_mask
 from torchvo360.data.synthetic import SyntheticSequence
 from torchvo360.data.tum import read_tum
 from torchvo360.evaluation import evaluate
+from torchvo360.learn.checkpoint import load_checkpoint
+from torchvo360.learn.plugin import DepthEstimator, build
 from torchvo360.outputs import Record, can_plot, describe, output_folder, write_all
-from torchvo360.settings import SYNTHETIC, RunConfig, embedded_clip
+from torchvo360.settings import SHIPPED, SYNTHETIC, DepthConfig, RunConfig, embedded_clip
 from torchvo360.vo import VisualOdometry
 
 AUTO_SIZE = (1024, 512)
 """Width and height of wider input under `resize=auto`: more pixels cost time and gain little."""
+
+DEPTH_CHECKPOINT = Path(learn.__file__).parent / "checkpoints" / "depth.safetensors"
+"""What `depth=learned` loads: made by train/depth.py; the .json beside it holds the command and the figures."""
 
 
 @dataclass(frozen=True)
@@ -90,13 +98,17 @@ def run(config: RunConfig, *, config_yaml: str = "") -> Outcome:
     sequence, notes = open_input(config)
     truth = sequence.truth if config.truth is None else _read_truth(config.truth)
     mask = None if config.mask is None else parse_mask(config.mask, sequence.camera)
+    depth = open_depth(config.depth)
     with (
         output_folder(config.out, sequence.name, overwrite=config.overwrite) as folder,
         _threads(config.threads),
         torch.inference_mode(),
         StopSignals() as stop,
     ):
-        odometry = VisualOdometry(sequence.camera, config.vo, mask=mask, seed=config.seed, device=config.device)
+        depth = None if depth is None else depth.to(config.device)
+        odometry = VisualOdometry(
+            sequence.camera, config.vo, mask=mask, depth=depth, seed=config.seed, device=config.device
+        )
         journey = _step_through(sequence, odometry, truth, stop, config.progress)
         if journey.usable < 2 and stop.received:
             return Outcome([], "stopped before two frames were done: nothing is written.", 128 + stop.received)
@@ -201,6 +213,23 @@ def open_input(config: RunConfig) -> tuple[ImageSequence, list[str]]:
     size, auto = (" x ".join(map(str, pair)) for pair in (sequence.fit.target, AUTO_SIZE))
     note = f"frames of {size} were brought down to {auto}; resize=WxH chooses a size, resize=null keeps theirs."
     return opened(resize=AUTO_SIZE), [note]
+
+
+def open_depth(config: DepthConfig) -> nn.Module | None:
+    """Return the depth network that the settings name, in evaluation mode; None where they name none.
+
+    Raises:
+        InputError: It cannot be made, or its checkpoint is missing, damaged or another network's.
+    """
+    target, checkpoint = config._target_, config.checkpoint
+    if target is not None and checkpoint in (None, SHIPPED):
+        return build({"_target_": target, **(config.arguments or {})}, DepthEstimator).eval()
+    if checkpoint is None:
+        return None
+    try:
+        return load_checkpoint(DEPTH_CHECKPOINT if checkpoint == SHIPPED else checkpoint, target)
+    except InputError as error:
+        raise InputError(f"depth.{error}") from None
 
 
 def _read_truth(path: str) -> Trajectory:

@@ -13,6 +13,9 @@ from torchvo360.vo import OdometryConfig
 SYNTHETIC = "synthetic"
 """The input that is rendered, with the settings `synthetic`."""
 
+SHIPPED = "shipped"
+"""The depth network that comes with the package."""
+
 CLIPS = Path(__file__).parent / "data" / "clips"
 
 MAX_SEED = 2**63 - 1
@@ -27,6 +30,29 @@ class CameraConfig:
 
     def __post_init__(self) -> None:
         check_choice("fit", self.fit, ("none", "stretch", "crop"))
+
+
+@dataclass(kw_only=True)
+class DepthConfig:
+    """The network that gives inverse ranges in metres, from which the odometry begins at once; none by default."""
+
+    checkpoint: str | None = None
+    """Its file, NAME.safetensors with NAME.json beside it; `shipped` for the package's own."""
+    _target_: str | None = None
+    """The dotted name of a class of one's own that fulfils `DepthEstimator`: in place of `shipped`, or for the tensors
+    of the checkpoint."""
+    arguments: Any = None
+    """Arguments of that class, such as {width: 128}, where no checkpoint holds them."""
+
+    def __post_init__(self) -> None:
+        if self.checkpoint == "":
+            raise InputError("checkpoint: expected a file, got an empty name.")
+        if self.arguments is None:
+            return
+        if not isinstance(self.arguments, dict):
+            raise InputError(f"arguments: expected a mapping such as {{width: 128}}, got {self.arguments!r}.")
+        if self._target_ is None or self.checkpoint not in (None, SHIPPED):
+            raise InputError(f"arguments: expected none but for a _target_ without a checkpoint, got {self.arguments}.")
 
 
 @dataclass(kw_only=True)
@@ -66,6 +92,7 @@ class RunConfig:
     """Show a progress bar where standard error is a terminal."""
     synthetic: SyntheticConfig = field(default_factory=SyntheticConfig)
     vo: OdometryConfig = field(default_factory=OdometryConfig)
+    depth: DepthConfig = field(default_factory=DepthConfig)
 
     def __post_init__(self) -> None:
         self.plot = str(self.plot).lower()  # true and false are no words to YAML

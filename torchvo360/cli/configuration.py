@@ -18,7 +18,7 @@ from omegaconf.errors import OmegaConfBaseException
 from torchvo360.checks import InputError
 from torchvo360.settings import RunConfig
 
-PATHS = ("input", "truth", "out")
+PATHS = ("input", "truth", "out", "depth.checkpoint")
 """Keys whose value is taken as it stands: brackets, commas and equal signs are common in names of files."""
 
 TYPE_ERRORS = (

@@ -3,6 +3,9 @@
 A step builds the frame's pyramid. Without a map the initialiser follows corners until it can make one; with a map the
 follower predicts, tracks, fuses and makes keyframes. A frame that is lost is looked for in the earlier keyframes, and
 after a while a new map is started and joined to the old one.
+
+With a depth network the first frame is a map already, in metres; the corners go on, and the start they make, which is
+more exact, takes its place in the network's unit.
 """
 
 import math
@@ -12,7 +15,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import torch
 from jaxtyping import Bool, Float64
-from torch import Tensor
+from torch import Tensor, nn
 
 from torchvo360 import lie
 from torchvo360.cameras import Camera
@@ -24,6 +27,7 @@ from torchvo360.vo.config import OdometryConfig
 from torchvo360.vo.follow import Follower, carried_keyframe
 from torchvo360.vo.frame import FrameBuilder, PyramidFrame
 from torchvo360.vo.initialise import Initialiser, Start
+from torchvo360.vo.learned import LearnedRanges
 from torchvo360.vo.pending import fill_in, track_pending
 from torchvo360.vo.recover import Recovery
 from torchvo360.vo.state import FrameEstimate, State
@@ -50,6 +54,7 @@ class VisualOdometry:
         config: OdometryConfig | None = None,
         *,
         mask: Bool[Tensor, "H W"] | None = None,
+        depth: nn.Module | None = None,
         seed: int = 0,
         device: torch.device | str = "cpu",
     ) -> None:
@@ -59,6 +64,8 @@ class VisualOdometry:
             camera: The camera of all frames.
             config: Settings.
             mask: Pixels that may be used; all by default.
+            depth: A network that fulfils `DepthEstimator`, on `device`: the odometry then begins with the first frame,
+                and its unit is the network's metre.
             seed: Of the random samples at the start: equal seeds give equal trajectories.
             device: Where the images are kept.
 
@@ -74,6 +81,9 @@ class VisualOdometry:
         levels = 1 + max(0, round(math.log2(max(1.0, camera.width / config.coarsest_width))))
         self._builder = FrameBuilder(camera, levels, config.blur_px, mask, config.saturation, device)
         self._recovery = Recovery(self._builder, config.track, config.map.max_relative_variance)
+        self._learned: LearnedRanges | None = None
+        if depth is not None:
+            self._learned = LearnedRanges(depth, self._builder, config.map, config.track.min_points)
         self._generator = torch.Generator().manual_seed(seed)
         self._estimates: list[FrameEstimate] = []
         self._clouds: list[PointCloud] = []
@@ -83,6 +93,7 @@ class VisualOdometry:
         self._T_world_ref = torch.eye(4, dtype=torch.float64)
         self._unit = 1.0
         self._unconfirmed: Initialiser | None = None
+        self._unsettled = False
         self._remembered_before = 0
         self._lost = 0
 
@@ -92,7 +103,8 @@ class VisualOdometry:
         A frame with a problem gets a predicted pose. While there is no map the pose is a rotation.
 
         Raises:
-            InputError: The image is not of the camera's size, or index or time do not increase.
+            InputError: The image is not of the camera's size, or index or time do not increase, or the depth network
+                does not give ranges.
         """
         began = time.perf_counter()
         self._check(frame)
@@ -158,25 +170,45 @@ class VisualOdometry:
         if found is not None:
             return found
         starter = self._initialiser
-        if not starter.pending:
+        before = starter.pending[0] if starter.pending else None
+        if before is None:
             starter.begin(frame)
-        else:
-            before = starter.pending[0]
-            start = starter.add(frame)
-            if start is not None:
-                return self._begin_map(start, frame)
-            if starter.pending[0] is not before:
-                # The corners ran out: go on from here, with the rotation reached so far.
-                R = starter.R_ref_before
-                self._T_world_ref = self._T_world_ref @ lie.se3(R.mT, R.new_zeros(3))
+        elif (start := starter.add(frame)) is not None:
+            return self._begin_map(start, frame)
+        elif starter.pending[0] is not before:
+            # The corners ran out: go on from here, with the rotation reached so far.
+            R = starter.R_ref_before
+            self._T_world_ref = self._T_world_ref @ lie.se3(R.mT, R.new_zeros(3))
+        if starter.pending[0] is not before and (begun := self._begin_learned(frame)) is not None:
+            return begun
         R_cam_ref = starter.rotations[frame.index]
         T_world_cam = self._T_world_ref @ lie.se3(R_cam_ref.mT, R_cam_ref.new_zeros(3))
         return _estimate(frame, T_world_cam, self._waiting, starter.reason, None)
 
+    def _begin_learned(self, frame: PyramidFrame) -> FrameEstimate | None:
+        """Make the frame at which the corners begin a map of learned ranges; None without a network that knows them."""
+        key = None if self._learned is None else self._learned.keyframe(frame, self._T_world_ref)
+        if key is None:
+            return None
+        self._follower, self._unsettled = Follower(self._builder, self.config, self._recovery, key, placed=frame), True
+        self._lost, self._maps = 0, self._maps + 1
+        self._unit = float(key.points.rho[key.trusted(self.config.map.max_relative_variance)].median())
+        state = State.TRACKING if self._maps == 1 else State.RELOCALISED
+        return _estimate(frame, key.T_world_key, state, "learned_ranges", None)
+
+    def _settle(self, frame: PyramidFrame, T_world_cam: Float64[Tensor, "4 4"]) -> Start | None:
+        """Follow the corners beside a map of learned ranges; return the start that takes its place, once it can be."""
+        reference = self._initialiser.pending[0]
+        start = self._initialiser.add(frame)
+        if self._initialiser.pending[0] is not reference:
+            self._T_world_ref = T_world_cam
+        return start
+
     def _begin_map(self, start: Start, frame: PyramidFrame, reason: str = "") -> FrameEstimate:
         """Take over a start: fill in the poses of the frames that waited for it, and go on from the newest."""
-        # A new map after a loss takes the old one's unit by its median range.
-        start = start.rescaled(self._unit)
+        # A new map after a loss takes the old one's unit by its median range, unless a network knows the metre.
+        unit = None if self._learned is None else self._learned.unit(start.key)
+        start = start.rescaled(self._unit if unit is None else unit)
         start.key.T_world_key = self._T_world_ref
         follower = Follower(self._builder, self.config, self._recovery, start.key)
         known, found = track_pending(start, self._initialiser.pending, follower, self.config)
@@ -184,7 +216,11 @@ class VisualOdometry:
         # The initialiser goes on following its corners, until they have confirmed the start.
         self._unconfirmed, self._initialiser = self._initialiser, self._new_initialiser()
         self._remembered_before = len(self._recovery)
-        self._follower, self._lost, self._maps = follower, 0, self._maps + 1
+        if self._unsettled and self._follower is not None:
+            self._clouds += self._follower.clouds
+        else:
+            self._maps += 1
+        self._follower, self._unsettled, self._lost = follower, False, 0
         state = State.TRACKING if self._maps == 1 or reason else State.RELOCALISED
         reason = reason or ("ok" if self._maps == 1 else "new_map")
         return _estimate(frame, follower.T_world_cam, state, reason, found)
@@ -196,6 +232,8 @@ class VisualOdometry:
         if found is None:
             self._unconfirmed = None
             return self._lose(follower, frame)
+        if self._unsettled and (start := self._settle(frame, T_world_cam)) is not None:
+            return self._begin_map(start, frame, "start_settled")
         if self._unconfirmed is not None:
             T_cam_start = lie.se3_inverse(T_world_cam) @ self._T_world_ref
             over, start = self._unconfirmed.check(frame, T_cam_start)
@@ -221,6 +259,13 @@ class VisualOdometry:
     # Losses
 
     def _lose(self, follower: Follower, frame: PyramidFrame) -> FrameEstimate:
+        if self._unsettled:
+            self._unsettled = False
+            if not follower.clouds:
+                # The network misjudged its only keyframe: the corners have to do without.
+                self._follower, self._maps = None, self._maps - 1
+                return self._initialise(frame)
+            self._initialiser = self._new_initialiser()
         self._lost += 1
         found = self._relocalised(frame)
         if found is not None:
@@ -232,7 +277,7 @@ class VisualOdometry:
         self._T_world_ref, self._follower = follower.T_world_cam, None
         self._initialiser = self._new_initialiser()
         self._initialiser.begin(frame)
-        return _estimate(frame, self._T_world_ref, State.LOST, "restarting", None)
+        return self._begin_learned(frame) or _estimate(frame, self._T_world_ref, State.LOST, "restarting", None)
 
     def _relocalised(self, frame: PyramidFrame) -> FrameEstimate | None:
         """Look for a frame in the earlier keyframes, and go on from where it is found."""
@@ -246,7 +291,7 @@ class VisualOdometry:
             self._retire(self._follower)
         key = carried_keyframe(old, frame, found, self._builder, self.config)
         self._follower, self._lost = Follower(self._builder, self.config, self._recovery, key, placed=frame), 0
-        self._initialiser = self._new_initialiser()
+        self._initialiser, self._unsettled = self._new_initialiser(), False
         return _estimate(frame, key.T_world_key, State.RELOCALISED, "earlier_keyframe", found)
 
     def _retire(self, follower: Follower) -> None:

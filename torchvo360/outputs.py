@@ -25,7 +25,8 @@ from torchvo360.cameras import Camera
 from torchvo360.checks import InputError
 from torchvo360.data import Trajectory
 from torchvo360.evaluation import Evaluation
-from torchvo360.export import atomic_path, write_ply, write_tum
+from torchvo360.export import write_ply, write_tum
+from torchvo360.files import atomic_path
 from torchvo360.settings import RunConfig
 from torchvo360.viz import plot_trajectory
 from torchvo360.vo import FrameEstimate, OdometryResult

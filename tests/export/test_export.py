@@ -9,7 +9,8 @@ import torch
 from torchvo360.checks import InputError, ShapeError
 from torchvo360.data.trajectory import Trajectory
 from torchvo360.data.tum import read_tum
-from torchvo360.export import atomic_path, write_ply, write_tum
+from torchvo360.export import write_ply, write_tum
+from torchvo360.files import atomic_path
 from torchvo360.lie import se3_exp
 
 
@@ -76,7 +77,7 @@ def test_a_block_that_writes_nothing_and_a_folder_in_the_way_are_errors(tmp_path
 
 def test_a_process_that_is_killed_leaves_nothing_under_the_final_name(tmp_path):
     script = (
-        "import os, sys; from torchvo360.export.atomic import atomic_path\n"
+        "import os, sys; from torchvo360.files import atomic_path\n"
         "with atomic_path(sys.argv[1]) as path: path.write_text('half'); os._exit(1)"
     )
     final = tmp_path / "result.txt"

@@ -76,8 +76,9 @@ def _import_libraries() -> None:
 
 def _main(overrides: Sequence[str], multirun: bool, show: bool) -> int:
     from torchvo360.checks import InputError
-    from torchvo360.cli.configuration import compose, to_yaml
+    from torchvo360.cli.configuration import compose
     from torchvo360.cli.jobs import run_one, run_sweep
+    from torchvo360.cli.overrides import to_yaml
 
     try:
         if multirun:

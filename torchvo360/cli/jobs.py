@@ -11,7 +11,8 @@ from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 
 from torchvo360.checks import InputError
-from torchvo360.cli.configuration import check_keys, compose, explained, hydra_ready, quoted, to_yaml
+from torchvo360.cli.configuration import check_keys, compose, explained, hydra_ready
+from torchvo360.cli.overrides import quoted, to_yaml
 from torchvo360.outputs import new_folder
 from torchvo360.runner import run
 from torchvo360.settings import RunConfig

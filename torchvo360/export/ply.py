@@ -8,7 +8,7 @@ from jaxtyping import Float, UInt8
 from torch import Tensor
 
 from torchvo360.checks import InputError, check_floating, check_shape
-from torchvo360.export.atomic import atomic_path
+from torchvo360.files import atomic_path
 
 VERTEX = np.dtype([("xyz", "<f4", 3), ("rgb", "u1", 3)])
 

@@ -3,7 +3,7 @@
 from pathlib import Path
 
 from torchvo360.data.trajectory import Trajectory
-from torchvo360.export.atomic import atomic_path
+from torchvo360.files import atomic_path
 from torchvo360.lie import quaternion_from_matrix
 
 

@@ -6,6 +6,8 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+from torchvo360.checks import InputError
+
 
 @contextmanager
 def atomic_path(final: str | Path) -> Iterator[Path]:
@@ -24,3 +26,16 @@ def atomic_path(final: str | Path) -> Iterator[Path]:
         os.replace(temporary, final)
     finally:
         temporary.unlink(missing_ok=True)
+
+
+def write_atomically(path: Path, content: bytes | str) -> None:
+    """Write a whole file at once, which replaces an older one in one step.
+
+    Raises:
+        InputError: It cannot be written; then an older file is as it was.
+    """
+    try:
+        with atomic_path(path) as temporary:
+            temporary.write_bytes(content.encode() if isinstance(content, str) else content)
+    except OSError as error:
+        raise InputError(f"{path.name}: expected a folder to write to, got {path.parent}: {error.strerror}.") from None

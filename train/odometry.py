@@ -1,0 +1,89 @@
+"""What learned range is worth to the odometry: how far its metre is off, and what becomes of the accuracy."""
+
+import csv
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from statistics import median
+
+import torch
+from torch import nn
+
+from torchvo360.checks import InputError, check_choice
+from torchvo360.data.synthetic import WORLDS, SyntheticConfig, SyntheticSequence
+from torchvo360.evaluation import evaluate
+from torchvo360.vo import State, VisualOdometry
+
+
+@dataclass(kw_only=True)
+class WalksConfig:
+    """Walks through worlds never trained on, as `torchvo360 input=synthetic` renders them."""
+
+    worlds: list[str] = field(default_factory=lambda: list(WORLDS))
+    seeds: list[int] = field(default_factory=lambda: [1, 2, 3])
+    frames: int = 60
+    """Frames of each walk; 0 leaves the odometry out."""
+    exposure: str = "steps"
+    """Brightness over time: constant, steps or drift."""
+
+    def __post_init__(self) -> None:
+        for world in self.worlds:
+            check_choice("worlds", world, WORLDS)
+        if self.frames and self.frames < 3:
+            raise InputError(f"frames: expected at least 3, or 0, got {self.frames}.")
+
+
+@dataclass(frozen=True)
+class Walk:
+    """How the odometry did on one walk."""
+
+    world: str
+    seed: int
+    scale_error: float
+    """Share by which lengths of the estimate are off."""
+    ate_percent: float
+    ate_percent_without: float
+    """The same without learned range."""
+    untracked: int
+    """Frames in another state than TRACKING."""
+
+
+def walk_through(network: nn.Module, config: WalksConfig) -> list[Walk]:
+    """Run the odometry with and without a network on every walk."""
+    walks = []
+    for world in config.worlds if config.frames else ():
+        for seed in config.seeds:
+            settings = SyntheticConfig(world=world, seed=seed, frames=config.frames, exposure=config.exposure)
+            sequence = SyntheticSequence(settings)
+            frames = list(sequence)
+            results = []
+            for depth in (network, None):
+                odometry = VisualOdometry(sequence.camera, depth=depth)
+                with torch.inference_mode():
+                    for frame in frames:
+                        odometry.step(frame)
+                results.append(odometry.finish())
+            learned, without = (evaluate(result.trajectory, sequence.truth) for result in results)
+            states = [estimate.state for estimate in results[0].frames]
+            untracked = sum(state is not State.TRACKING for state in states)
+            walks.append(Walk(world, seed, 1 / learned.scale - 1, learned.ate_percent, without.ate_percent, untracked))
+    return walks
+
+
+def write_walks(path: Path, walks: Sequence[Walk]) -> None:
+    """Write one line a walk as CSV."""
+    with path.open("w", encoding="utf-8", newline="") as file:
+        table = csv.DictWriter(file, list(Walk.__dataclass_fields__), lineterminator="\n")
+        table.writeheader()
+        table.writerows(asdict(walk) for walk in walks)
+
+
+def figures_of(walks: Sequence[Walk]) -> dict[str, float]:
+    """Return medians and worst values over all walks."""
+    scale = [abs(walk.scale_error) for walk in walks]
+    return {
+        "walk_scale_error": median(scale),
+        "walk_scale_error_worst": max(scale),
+        "walk_ate_percent": median(walk.ate_percent for walk in walks),
+        "walk_ate_percent_without": median(walk.ate_percent_without for walk in walks),
+    }

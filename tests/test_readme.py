@@ -1,9 +1,11 @@
 """What the README shows works as it stands there."""
 
 import re
+import runpy
 from pathlib import Path
 
 import pytest
+import torch
 
 README = (Path(__file__).parents[1] / "README.md").read_text(encoding="utf-8")
 
@@ -17,15 +19,35 @@ def test_each_command_is_one_line_that_makes_its_own_environment(name):
     assert lines[0].startswith("python3 -m venv ")
 
 
-def test_the_example_runs_and_aligns_every_pair(capsys):
-    code = re.search(r"```python\n(.*?)```", README, re.DOTALL)
-    assert code is not None
+def test_the_examples_run_one_after_the_other(capsys):
+    codes = re.findall(r"```python\n(.*?)```", README, re.DOTALL)
+    assert len(codes) == 2
     names: dict = {}
-    exec(compile(code.group(1), "README.md", "exec"), names)
+    exec(compile(codes[0], "README.md", "exec"), names)
     result, pairs = names["result"], names["pairs"]
     assert (result.status == int(names["Status"].CONVERGED)).all()
     assert ((result.T_tgt_ref - pairs.T_tgt_ref_true).abs() < 5e-3).all()
     assert "CONVERGED" in capsys.readouterr().out
+    torch.manual_seed(0)
+    exec(compile(codes[1], "README.md", "exec"), names)
+    assert names["result"].differentiable.any()
+    assert all(p.grad.abs().max() > 0 for p in names["model"].parameters())
+
+
+@pytest.mark.parametrize("page", ["layer.md"])
+def test_the_snippets_of_a_page_run(page):
+    text = (Path(__file__).parents[1] / "docs" / page).read_text(encoding="utf-8")
+    for code in re.findall(r"```python\n(.*?)```", text, re.DOTALL):
+        exec(compile(code, page, "exec"), {})
+
+
+@pytest.mark.parametrize(
+    "script", sorted((Path(__file__).parents[1] / "examples").glob("*.py")), ids=lambda path: path.name
+)
+def test_an_example_runs(script, monkeypatch, capsys):
+    monkeypatch.setattr("sys.argv", [str(script)])
+    runpy.run_path(str(script), run_name="__main__")
+    assert capsys.readouterr().out
 
 
 def test_every_local_link_leads_somewhere():

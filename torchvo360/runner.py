@@ -9,7 +9,6 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
-from pathlib import Path
 from types import FrameType, TracebackType
 
 import cv2
@@ -17,7 +16,6 @@ import torch
 from torch import nn
 from tqdm import tqdm
 
-from torchvo360 import learn
 from torchvo360.checks import InputError
 from torchvo360.data import Frame, ImageSequence, Trajectory
 from torchvo360.data.images import open_images
@@ -25,17 +23,14 @@ from torchvo360.data.masks import parse_mask
 from torchvo360.data.synthetic import SyntheticSequence
 from torchvo360.data.tum import read_tum
 from torchvo360.evaluation import evaluate
-from torchvo360.learn.checkpoint import load_checkpoint
+from torchvo360.learn.checkpoint import SHIPPED_DEPTH, load_checkpoint
 from torchvo360.learn.plugin import DepthEstimator, build
 from torchvo360.outputs import Record, can_plot, describe, output_folder, write_all
 from torchvo360.settings import SHIPPED, SYNTHETIC, DepthConfig, RunConfig, embedded_clip
-from torchvo360.vo import VisualOdometry
+from torchvo360.vo import LEARNED, VisualOdometry
 
 AUTO_SIZE = (1024, 512)
 """Width and height of wider input under `resize=auto`: more pixels cost time and gain little."""
-
-DEPTH_CHECKPOINT = Path(learn.__file__).parent / "checkpoints" / "depth.safetensors"
-"""What `depth=learned` loads: made by train/depth.py; the .json beside it holds the command and the figures."""
 
 
 @dataclass(frozen=True)
@@ -121,6 +116,8 @@ def run(config: RunConfig, *, config_yaml: str = "") -> Outcome:
             of = f" of {sequence.length}" if sequence.length else ""
             notes.append(f"stopped by {stop.received.name} after {journey.frames}{of} frames; they are kept.")
         result = odometry.finish()
+        if depth is not None and not any(estimate.reason == LEARNED for estimate in result.frames):
+            notes.append("depth: the network was sure of too little of what it saw, so that the unit is not its metre.")
         evaluation, complaint = None, ""
         if truth is not None:
             try:
@@ -227,7 +224,7 @@ def open_depth(config: DepthConfig) -> nn.Module | None:
     if checkpoint is None:
         return None
     try:
-        return load_checkpoint(DEPTH_CHECKPOINT if checkpoint == SHIPPED else checkpoint, target)
+        return load_checkpoint(SHIPPED_DEPTH if checkpoint == SHIPPED else checkpoint, target)
     except InputError as error:
         raise InputError(f"depth.{error}") from None
 

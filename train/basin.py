@@ -64,7 +64,7 @@ class BasinConfig:
     both_deg: list[float] = field(default_factory=lambda: [15, 30, 45, 60, 75, 90, 105, 120])
     """Errors of starts that are wrong by 2 cm for each degree besides."""
     coarsest_widths: list[int] = field(default_factory=lambda: [64, 32, 16])
-    """`AlignConfig.coarsest_width` of intensity, of which the best is taken."""
+    """`AlignConfig.coarsest_width` of intensity, of which the best is taken at every point."""
 
     def scans(self) -> Iterator[tuple[str, float, float, float]]:
         """Yield what is displaced, by how much, and that in degrees and metres."""

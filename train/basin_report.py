@@ -54,14 +54,12 @@ class Row:
 
 @dataclass(frozen=True)
 class Comparison:
-    """Features against the best of intensity's settings, on one scan of one kind of worlds."""
+    """Features against intensity at its best, on one scan of one kind of worlds."""
 
     scan: str
     kind: str
-    intensity: str
-    """The best setting under the same light."""
     reach: float
-    """Error of the start up to which 80 % of the pairs converge by it."""
+    """Error of the start up to which 80 % of the pairs converge by intensity."""
     reach_is_end: bool
     """Whether that is the end of the scan, so that the reach may be larger."""
     features_twice: float
@@ -84,7 +82,7 @@ def curve(rows: Iterable[Row], method: str, light: str, scan: str, kind: str = A
 
 
 def at(points: dict[float, float], size: float) -> float:
-    """Return a curve's share between its points; 0 beyond a curve that has ended below, else that of its last point."""
+    """Return a curve's share, linear between its points; before the first and beyond the last it is theirs."""
     sizes = sorted(points)
     if size >= sizes[-1]:
         return points[sizes[-1]]
@@ -108,17 +106,17 @@ def reach(points: dict[float, float], most: float = MOST) -> float:
     return before
 
 
-def best_intensity(rows: Sequence[Row], light: str, scan: str, kind: str = ALL) -> str:
-    """Return the setting of intensity that reaches farthest; where none reaches anywhere, that of most pairs."""
+def intensity_curve(rows: Sequence[Row], light: str, scan: str, kind: str = ALL) -> dict[float, float]:
+    """Return, for every error of the start, the share by the setting of intensity that is best there."""
     names = sorted({row.method for row in rows if row.method.startswith(INTENSITY)})
-    curves = {name: curve(rows, name, light, scan, kind) for name in names}
-    return max(names, key=lambda name: (reach(curves[name]), sum(curves[name].values())))
+    curves = [curve(rows, name, light, scan, kind) for name in names]
+    sizes = sorted(size for size in set().union(*curves))
+    return {size: max(points.get(size, 0.0) for points in curves) for size in sizes}
 
 
 def compare(rows: Sequence[Row], scan: str, kind: str = ALL) -> Comparison:
-    """Compare features with intensity at its best, under each light by the setting that is best there."""
-    names = {light: best_intensity(rows, light, scan, kind) for light in (SAME, OTHER)}
-    intensity = {light: curve(rows, name, light, scan, kind) for light, name in names.items()}
+    """Compare features with intensity, which takes at every point the setting that is best there."""
+    intensity = {light: intensity_curve(rows, light, scan, kind) for light in (SAME, OTHER)}
     features = {light: curve(rows, FEATURES, light, scan, kind) for light in (SAME, OTHER)}
     limit = reach(intensity[SAME])
     starts = [size for size in intensity[SAME] if size <= limit]
@@ -129,7 +127,6 @@ def compare(rows: Sequence[Row], scan: str, kind: str = ALL) -> Comparison:
     return Comparison(
         scan=scan,
         kind=kind,
-        intensity=names[SAME],
         reach=limit,
         reach_is_end=limit == max(intensity[SAME]),
         features_twice=at(features[SAME], 2 * limit),
@@ -139,9 +136,22 @@ def compare(rows: Sequence[Row], scan: str, kind: str = ALL) -> Comparison:
     )
 
 
+def figures_of(rows: Sequence[Row]) -> dict[str, float]:
+    """Return the comparisons over all worlds as named figures, for a checkpoint."""
+    figures: dict[str, float] = {}
+    for scan in _scans(rows):
+        each = compare(rows, scan)
+        figures[f"{scan}_reach_of_intensity_{'m' if scan == TRANSLATION else 'deg'}"] = each.reach
+        figures[f"{scan}_features_at_twice"] = each.features_twice
+        figures[f"{scan}_features_at_twice_in_another_light"] = each.features_twice_other
+        figures[f"{scan}_lost_by_intensity"] = each.lost_intensity
+        figures[f"{scan}_lost_by_features"] = each.lost_features
+    return figures
+
+
 def report_basin(folder: Path, rows: Sequence[Row]) -> list[str]:
     """Write basin.csv, basin.md and basin.png into a folder, and return the comparison as lines."""
-    scans = [scan for scan in TITLES if any(row.scan == scan for row in rows)]
+    scans = _scans(rows)
     kinds = list(dict.fromkeys(row.kind for row in rows))
     comparisons = [compare(rows, scan, kind) for scan in scans for kind in kinds]
     text = io.StringIO()
@@ -164,7 +174,7 @@ def plot_basin(path: Path, rows: Sequence[Row]) -> None:
     """
     from matplotlib.figure import Figure
 
-    scans = [scan for scan in TITLES if any(row.scan == scan for row in rows)]
+    scans = _scans(rows)
     figure = Figure(figsize=(4.6 * len(scans), 4.2), layout="constrained")
     for axes, scan in zip(figure.subplots(1, len(scans), squeeze=False, sharey=True)[0], scans, strict=True):
         _draw(axes, rows, scan)
@@ -173,11 +183,15 @@ def plot_basin(path: Path, rows: Sequence[Row]) -> None:
     figure.savefig(path, dpi=130)
 
 
+def _scans(rows: Sequence[Row]) -> list[str]:
+    """Return what was scanned, in the order of the titles."""
+    return [scan for scan in TITLES if any(row.scan == scan for row in rows)]
+
+
 def _draw(axes: "Axes", rows: Sequence[Row], scan: str) -> None:
     for light, style in ((SAME, "-"), (OTHER, "--")):
-        best = best_intensity(rows, light, scan)
-        for name, method in ((INTENSITY, best), (SPREAD_COLOUR, SPREAD_COLOUR), (FEATURES, FEATURES)):
-            points = curve(rows, method, light, scan)
+        for name in COLOURS:
+            points = intensity_curve(rows, light, scan) if name == INTENSITY else curve(rows, name, light, scan)
             label = f"{name}, {'same light' if light == SAME else 'another light'}"
             axes.plot(list(points), list(points.values()), style, color=COLOURS[name], marker=".", label=label)
     axes.axhline(MOST, color="#B3B3B3", linewidth=0.8)
@@ -189,15 +203,15 @@ def _draw(axes: "Axes", rows: Sequence[Row], scan: str) -> None:
 
 def _comparison_table(comparisons: Sequence[Comparison]) -> list[str]:
     lines = [
-        "| start | worlds | intensity's best | 80 % up to | features at twice that | in another light | "
+        "| start | worlds | intensity: 80 % up to | features at twice that | in another light | "
         "lost by another light: intensity | features |",
-        "| --- | --- | --- | ---: | ---: | ---: | ---: | ---: |",
+        "| --- | --- | ---: | ---: | ---: | ---: | ---: |",
     ]
     for each in comparisons:
         unit = "m" if each.scan == TRANSLATION else "deg"
         limit = f"{'at least ' if each.reach_is_end else ''}{each.reach:.3g} {unit}"
         shares = (each.features_twice, each.features_twice_other, each.lost_intensity, each.lost_features)
-        cells = [each.scan, each.kind, each.intensity, limit, *(f"{share:.0%}" for share in shares)]
+        cells = [each.scan, each.kind, limit, *(f"{share:.0%}" for share in shares)]
         lines.append(f"| {' | '.join(cells)} |")
     return lines
 

@@ -17,13 +17,14 @@ from jaxtyping import Float, Float64
 from torch import Tensor, nn
 
 from basin import BasinConfig, measure_basin
-from basin_report import report_basin
-from command import Train, TrainingConfig, main
+from basin_report import figures_of, report_basin
+from command import Train, TrainingConfig, is_first, main
 from illumination import IlluminationConfig, relit
 from pairs import PairsConfig, ViewPairs, displaced, drawn, median_range, render_pairs, turned
 from torchvo360 import AlignConfig
 from torchvo360.checks import InputError
-from torchvo360.learn import FeatureExtractor, FeaturePyramid, build, load_checkpoint
+from torchvo360.learn import FeatureExtractor, FeaturePyramid, build, load_checkpoint, save_checkpoint
+from torchvo360.learn.checkpoint import read_config
 from torchvo360.learn.features import align_features, feature_alignment, pair_features
 from torchvo360.learn.range_losses import warped
 from torchvo360.lie import se3_exp, se3_inverse, se3_log
@@ -207,18 +208,16 @@ def _device(module: nn.Module) -> torch.device:
     return next(module.parameters()).device
 
 
-def _tiled(four: Float[Tensor, "4 3 H W"]) -> Float[Tensor, "3 2H 2W"]:
-    """Put two references above their targets."""
-    return torch.cat([torch.cat(list(pair), -1) for pair in four.chunk(2)], -2)
-
-
 def run(config: FeaturesConfig, folder: Path, train: Train) -> list[str]:
-    """Learn features, and measure the basin of what was best."""
+    """Learn features, and measure the basin of the best network; its figures go into the checkpoint."""
     outcome = train(FeatureExperiment.make(config))
-    if not (config.measure and outcome.success):
+    if not (config.measure and outcome.success and is_first()):
         return []
     network = load_checkpoint(outcome.checkpoint, target=config.features["_target_"])
-    return report_basin(folder, measure_basin(network, config.basin, config.illumination))
+    rows = measure_basin(network, config.basin, config.illumination)
+    beside = read_config(outcome.checkpoint)
+    save_checkpoint(outcome.checkpoint, network, {**beside, "figures": {**beside["figures"], **figures_of(rows)}})
+    return report_basin(folder, rows)
 
 
 if __name__ == "__main__":

@@ -12,6 +12,7 @@ from torch import nn
 from torchvo360.checks import InputError, check_choice
 from torchvo360.data.synthetic import WORLDS, SyntheticConfig, SyntheticSequence
 from torchvo360.evaluation import evaluate
+from torchvo360.files import atomic_path
 from torchvo360.vo import State, VisualOdometry
 
 
@@ -72,7 +73,7 @@ def walk_through(network: nn.Module, config: WalksConfig) -> list[Walk]:
 
 def write_walks(path: Path, walks: Sequence[Walk]) -> None:
     """Write one line a walk as CSV."""
-    with path.open("w", encoding="utf-8", newline="") as file:
+    with atomic_path(path) as part, part.open("w", encoding="utf-8", newline="") as file:
         table = csv.DictWriter(file, list(Walk.__dataclass_fields__), lineterminator="\n")
         table.writeheader()
         table.writerows(asdict(walk) for walk in walks)

@@ -4,7 +4,6 @@ import csv
 import json
 import math
 from dataclasses import replace
-from importlib.resources import files
 
 import pytest
 import torch
@@ -18,6 +17,7 @@ from pairs import PairsConfig, displaced, median_range, mirrored, render_pairs, 
 from torchvo360 import AlignConfig
 from torchvo360.checks import InputError
 from torchvo360.learn import load_checkpoint
+from torchvo360.learn.checkpoint import SHIPPED_FEATURES
 from torchvo360.learn.range_losses import warped
 from torchvo360.lie import so3_angle
 
@@ -127,13 +127,13 @@ def test_a_few_steps_lower_the_loss(experiment):
     batch = experiment.batch(0, 0, 1)
     optimizer = torch.optim.Adam(module.parameters(), 5e-3)
     values = []
-    for _ in range(12):
+    for _ in range(8):
         losses = experiment.losses(module, batch)
         optimizer.zero_grad()
         losses["loss"].backward()
         optimizer.step()
         values.append(float(losses["loss"].detach()))
-    assert min(values[-4:]) < 0.7 * values[0]
+    assert min(values[-3:]) < 0.8 * values[0]
     figures = experiment.validate(module)
     assert all(math.isfinite(value) for value in figures.values())
     for name, picture in experiment.pictures(module).items():
@@ -146,8 +146,8 @@ def test_the_script_trains_and_measures(tmp_path, capsys):
         f"out={tmp_path / 'run'}",
         *("trainer.steps=2", "trainer.batch_size=2", "pairs.pairs=4", "pairs.kinds=[room]", "validation_pairs=2"),
         *(f"+features.{key}={value}".replace(" ", "") for key, value in SMALL.items() if key != "_target_"),
-        *("basin.pairs=2", "basin.kinds=[room]", "basin.rotations_deg=[5,20]", "basin.coarsest_widths=[16]"),
-        *("basin.translations_m=[0.2]", "basin.both_deg=[10]"),
+        *("basin.pairs=2", "basin.kinds=[room]", "basin.rotations_deg=[10]", "basin.coarsest_widths=[16]"),
+        *("basin.translations_m=[]", "basin.both_deg=[]"),
     ]
     assert main("features", FeaturesConfig, run, overrides) == 0
     assert "features at twice that" in capsys.readouterr().out
@@ -158,6 +158,8 @@ def test_the_script_trains_and_measures(tmp_path, capsys):
     assert {row["light"] for row in rows} == {SAME, OTHER}
     assert all(0 <= float(row["converged"]) <= 1 for row in rows)
     assert load_checkpoint(folder / "best").down[0][0].out_channels == 8
+    told = json.loads((folder / "best.json").read_text())
+    assert 0 <= told["figures"]["rotation_features_at_twice"] <= 1
 
 
 @pytest.mark.parametrize(
@@ -177,7 +179,7 @@ def test_the_reach_lies_where_a_curve_falls_below_the_share():
     assert at({10: 1.0, 20: 0.5}, 99) == 0.5
 
 
-def test_intensity_is_compared_at_its_best_setting_in_each_light(tmp_path):
+def test_intensity_is_compared_at_the_setting_that_is_best_at_each_point(tmp_path):
     def rows(method, light, shares):
         return [
             Row(method, light, ROTATION, size, "all", share, 0.1, 0.001)
@@ -195,7 +197,6 @@ def test_intensity_is_compared_at_its_best_setting_in_each_light(tmp_path):
         *rows(FEATURES, OTHER, (0.9, 0.9, 0.9, 0.7)),
     ]
     told_of = compare(told, ROTATION)
-    assert told_of.intensity == "intensity 16"
     assert (told_of.reach, told_of.features_twice, told_of.features_twice_other) == pytest.approx((40, 0.9, 0.7))
     assert told_of.lost_intensity == pytest.approx((0.4 + 0.4 + 0.7) / 3)
     assert told_of.lost_features == pytest.approx(0.1)
@@ -214,7 +215,7 @@ def test_raw_intensity_has_a_basin_and_it_ends(pairs):
 
 
 def test_the_shipped_features_converge_where_intensity_does_not(pairs):
-    network = load_checkpoint(files("torchvo360") / "learn" / "checkpoints" / "features")
+    network = load_checkpoint(SHIPPED_FEATURES)
     generator = torch.Generator().manual_seed(5)
     same = turned(pairs, generator)
     other = same.with_images(same.ref, relit(same.tgt, IlluminationConfig(), generator))
@@ -231,8 +232,10 @@ def test_the_shipped_features_converge_where_intensity_does_not(pairs):
 
 
 def test_the_shipped_checkpoint_is_small_and_tells_how_it_came_about():
-    folder = files("torchvo360") / "learn" / "checkpoints"
-    assert (folder / "features.safetensors").stat().st_size < 2e6
-    told = json.loads((folder / "features.json").read_text())
+    assert SHIPPED_FEATURES.with_suffix(".safetensors").stat().st_size < 2e6
+    told = json.loads(SHIPPED_FEATURES.with_suffix(".json").read_text())
     assert told["made_by"].startswith("python train/features.py")
-    assert told["figures"]
+    figures = told["figures"]
+    for scan in ("rotation", "translation", "both"):
+        assert figures[f"{scan}_features_at_twice"] >= 0.8
+        assert figures[f"{scan}_lost_by_features"] <= figures[f"{scan}_lost_by_intensity"] / 3

@@ -22,6 +22,9 @@ NOTES = ("made_by", "figures")
 
 HOME = "torchvo360.learn."
 
+SHIPPED_FEATURES, SHIPPED_DEPTH = (Path(__file__).parent / "checkpoints" / name for name in ("features", "depth"))
+"""The checkpoints that come with the package; the json beside each names the command that made it."""
+
 
 def save_checkpoint(path: str | Path, module: nn.Module, config: Mapping[str, Any]) -> None:
     """Write a network to `path`.safetensors and `path`.json; each appears only when it is complete.

@@ -3,6 +3,6 @@
 from torchvo360.vo.cloud import PointCloud
 from torchvo360.vo.config import OdometryConfig
 from torchvo360.vo.state import FrameEstimate, State
-from torchvo360.vo.system import OdometryResult, VisualOdometry
+from torchvo360.vo.system import LEARNED, OdometryResult, VisualOdometry
 
-__all__ = ["FrameEstimate", "OdometryConfig", "OdometryResult", "PointCloud", "State", "VisualOdometry"]
+__all__ = ["LEARNED", "FrameEstimate", "OdometryConfig", "OdometryResult", "PointCloud", "State", "VisualOdometry"]

@@ -33,6 +33,9 @@ from torchvo360.vo.recover import Recovery
 from torchvo360.vo.state import FrameEstimate, State
 from torchvo360.vo.track import Track
 
+LEARNED = "learned_ranges"
+"""The reason of a frame whose map is made of a depth network's ranges."""
+
 
 @dataclass(frozen=True)
 class OdometryResult:
@@ -194,7 +197,7 @@ class VisualOdometry:
         self._lost, self._maps = 0, self._maps + 1
         self._unit = float(key.points.rho[key.trusted(self.config.map.max_relative_variance)].median())
         state = State.TRACKING if self._maps == 1 else State.RELOCALISED
-        return _estimate(frame, key.T_world_key, state, "learned_ranges", None)
+        return _estimate(frame, key.T_world_key, state, LEARNED, None)
 
     def _settle(self, frame: PyramidFrame, T_world_cam: Float64[Tensor, "4 4"]) -> Start | None:
         """Follow the corners beside a map of learned ranges; return the start that takes its place, once it can be."""

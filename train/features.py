@@ -11,6 +11,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+import cv2
 import torch
 import torch.nn.functional as F
 from jaxtyping import Float, Float64
@@ -27,6 +28,7 @@ from torchvo360.learn import FeatureExtractor, FeaturePyramid, build, load_check
 from torchvo360.learn.checkpoint import read_config
 from torchvo360.learn.features import align_features, feature_alignment, pair_features
 from torchvo360.learn.range_losses import warped
+from torchvo360.learn.record import add_picture
 from torchvo360.lie import se3_exp, se3_inverse, se3_log
 
 ASTRAY_PX = 2.0
@@ -217,7 +219,10 @@ def run(config: FeaturesConfig, folder: Path, train: Train) -> list[str]:
     rows = measure_basin(network, config.basin, config.illumination)
     beside = read_config(outcome.checkpoint)
     save_checkpoint(outcome.checkpoint, network, {**beside, "figures": {**beside["figures"], **figures_of(rows)}})
-    return report_basin(folder, rows)
+    table = report_basin(folder, rows)
+    picture = torch.from_numpy(cv2.imread(str(folder / "basin.png"))).flip(-1).permute(2, 0, 1) / 255
+    add_picture(folder, outcome.steps, "basin", picture)
+    return table
 
 
 if __name__ == "__main__":

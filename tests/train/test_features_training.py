@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import pytest
 import torch
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from basin import has_converged, intensity, learned
 from basin_report import FEATURES, OTHER, ROTATION, SAME, Row, at, compare, reach, report_basin
@@ -158,6 +159,10 @@ def test_the_script_trains_and_measures(tmp_path, capsys):
     assert {row["light"] for row in rows} == {SAME, OTHER}
     assert all(0 <= float(row["converged"]) <= 1 for row in rows)
     assert load_checkpoint(folder / "best").down[0][0].out_channels == 8
+    pictures: set[str] = set()
+    for file in (folder / "tensorboard").iterdir():
+        pictures |= set(EventAccumulator(str(file)).Reload().Tags()["images"])
+    assert {"basin", "images", "warped/by_the_solution", "features/0"} <= pictures
     told = json.loads((folder / "best.json").read_text())
     assert 0 <= told["figures"]["rotation_features_at_twice"] <= 1
 

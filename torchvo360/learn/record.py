@@ -7,6 +7,7 @@ import math
 from collections.abc import Mapping
 from pathlib import Path
 from types import TracebackType
+from typing import Any
 
 from jaxtyping import Float
 from torch import Tensor
@@ -33,12 +34,8 @@ class Record:
     """
 
     def __init__(self, folder: Path, step: int, steps: int, *, progress: bool) -> None:
-        try:
-            tensorboard = importlib.import_module("torch.utils.tensorboard")
-        except ModuleNotFoundError:
-            raise InputError("train: expected tensorboard, which pip install 'torchvo360[train]' brings.") from None
         self._tables = {name: _Table(folder / name, step) for name in (TRAIN, VALIDATION)}
-        self._board = tensorboard.SummaryWriter(str(folder / TENSORBOARD), purge_step=step + 1 if step else None)
+        self._board = _tensorboard().SummaryWriter(str(folder / TENSORBOARD), purge_step=step + 1 if step else None)
         disable = None if progress else True  # None: where standard error is no terminal
         self._bar = tqdm(total=steps, initial=step, unit="step", disable=disable, leave=False, dynamic_ncols=True)
 
@@ -74,6 +71,19 @@ class Record:
     def flush(self) -> None:
         """Write out what is held back, before a state is saved that counts on it."""
         self._board.flush()
+
+
+def add_picture(folder: Path, step: int, name: str, picture: Float[Tensor, "3 H W"]) -> None:
+    """Add a picture of what a training came to, values in [0, 1], to the TensorBoard files in its folder."""
+    with _tensorboard().SummaryWriter(str(folder / TENSORBOARD)) as board:
+        board.add_image(name, picture, step)
+
+
+def _tensorboard() -> Any:
+    try:
+        return importlib.import_module("torch.utils.tensorboard")
+    except ModuleNotFoundError:
+        raise InputError("train: expected tensorboard, which pip install 'torchvo360[train]' brings.") from None
 
 
 class _Table:

@@ -76,16 +76,18 @@ def attach_steps(
     free = free_parameters(config, start[0].device)
     problem = level_problem(level.reference, level.target, config, free)
     again = replay(problem, start, trace, masked=config.solver.fixed_steps)
-    # The values stay those of the solve: summing in another order could change their last digits.
-    return tuple(value + (x - x.detach()) for value, x in zip(solution.state, again, strict=True))
+    # The values stay those of the solve: summing in another order could change their last digits. What no step leads
+    # to still hangs on its inputs, with gradients of zero: a batch that fails as a whole can be gone back through.
+    link = sum(0.0 * x.sum() for x in (*_tensors(level.reference), *_tensors(level.target)) if x.requires_grad)
+    return tuple(value + (x - x.detach()) + link for value, x in zip(solution.state, again, strict=True))
 
 
 def has_gradient(level: Level, start: State, config: AlignConfig) -> bool:
-    """Return whether anything that a level's solution depends on asks for gradients.
+    """Return whether anything that gradients can reach asks for them: the start only where all steps are unrolled.
 
     Inside the transforms of `torch.func` tensors do not tell: where steps are fixed, the answer is yes.
     """
-    tensors = [*_tensors(level.reference), *_tensors(level.target), *start]
+    tensors = [*_tensors(level.reference), *_tensors(level.target), *(start if config.backward == "unroll" else ())]
     return config.solver.fixed_steps or any(tensor.requires_grad for tensor in tensors)
 
 

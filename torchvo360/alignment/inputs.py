@@ -8,11 +8,10 @@ import torch
 from jaxtyping import Bool, Float, Float64
 from torch import Tensor
 
+from torchvo360 import lie
+from torchvo360.alignment.level import MAX_TRANSLATION
 from torchvo360.cameras import Camera
 from torchvo360.checks import InputError, check_same_device, check_shape, is_pose
-
-MAX_TRANSLATION = 1e6
-"""Starts farther away than this, m, are no start of anything."""
 
 MAX_RHO = 1e9
 """Inverse ranges above this, 1/m, are no range of anything; their squares would overflow in float32."""
@@ -31,7 +30,7 @@ class Inputs:
     ref_finite: list[Bool[Tensor, "B h w"]]
     tgt_finite: list[Bool[Tensor, "B h w"]]
     weight_ref: list[Float[Tensor, "B h w"]] | None
-    """Between 0 and 1."""
+    """Finite, at least 0, scaled (`_normalised`)."""
     weight_tgt: list[Float[Tensor, "B h w"]] | None
     rho: Float[Tensor, "B H W"]
     known: Bool[Tensor, "B H W"]
@@ -70,7 +69,15 @@ def read_inputs(
     _check(refs, tgts, rho, camera, refs_weight, tgts_weight, is_pyramid=is_pyramid)
     batch = rho.shape[:-2]
     _check_rest(batch, rho, T_tgt_ref, mask, rho_variance, intrinsics)
-    check_same_device(ref=refs[0], tgt=tgts[0], rho=rho, mask=mask, T_tgt_ref=T_tgt_ref, intrinsics=intrinsics)
+    lists = {"ref": refs, "tgt": tgts, "weight_ref": refs_weight or [], "weight_tgt": tgts_weight or []}
+    maps = {f"{name}[{k}]" if is_pyramid else name: map for name, each in lists.items() for k, map in enumerate(each)}
+    others = {"T_tgt_ref": T_tgt_ref, "rho_variance": rho_variance, "intrinsics": intrinsics}
+    check_same_device(**maps, rho=rho, mask=mask, **others)
+    for name, value in {**maps, "rho": rho, **others}.items():
+        if value is not None and value.dtype not in (torch.float32, torch.float64):
+            raise InputError(f"{name}: expected float32 or float64, got {value.dtype}.")
+    if mask is not None and mask.dtype != torch.bool:
+        raise InputError(f"mask: expected bool, got {mask.dtype}.")
 
     B, dtype = math.prod(batch), refs[0].dtype
     flat_ref, ref_finite = _finite_maps(refs, B, dtype)
@@ -78,11 +85,11 @@ def read_inputs(
     flat_rho = rho.reshape(B, *rho.shape[-2:]).to(dtype)
     known = (flat_rho >= 0) & (flat_rho <= MAX_RHO)
     if mask is not None:
-        known = known & mask.reshape(flat_rho.shape).bool()
+        known = known & mask.reshape(flat_rho.shape)
     variance = None
     if rho_variance is not None:
         variance = rho_variance.reshape(flat_rho.shape).to(dtype)
-        sound = (variance >= 0) & torch.isfinite(variance)
+        sound = (variance >= 0) & (variance <= MAX_RHO**2)
         known, variance = known & sound, torch.where(sound, variance, 0.0)
     T, started = _starts(T_tgt_ref, B, rho.device)
     k, calibrated = _calibrations(intrinsics, camera, B)
@@ -148,9 +155,6 @@ def _check(
         for level, (value, like) in enumerate(zip(maps, ref, strict=True)):
             shape = like.shape if name == "tgt" else (*like.shape[:-3], *like.shape[-2:])
             check_shape(f"{name}[{level}]" if is_pyramid else name, value, " ".join(str(size) for size in shape))
-    for name, value in (("ref", ref[0]), ("tgt", tgt[0]), ("rho", rho)):
-        if value.dtype not in (torch.float32, torch.float64):
-            raise InputError(f"{name}: expected float32 or float64, got {value.dtype}.")
 
 
 def _check_rest(
@@ -180,13 +184,20 @@ def _finite_maps(maps: list[Tensor], B: int, dtype: torch.dtype) -> tuple[list[T
 
 
 def _weights(maps: list[Tensor] | None, B: int, dtype: torch.dtype) -> list[Tensor] | None:
-    """Return weights of at most 1 in every image, and 0 in place of what is none: only ratios count."""
-    if maps is None:
-        return None
-    flat = [value.reshape(B, *value.shape[-2:]).double() for value in maps]
-    clean = [torch.where((value >= 0) & torch.isfinite(value), value, 0.0) for value in flat]
-    tiny = torch.finfo(torch.float64).tiny
-    return [(value / value.detach().amax((1, 2), keepdim=True).clamp_min(tiny)).to(dtype) for value in clean]
+    """Return weights whose sum is the number of pixels that they amount to, `(sum w)^2 / sum w^2`: ratios count."""
+    return (
+        None
+        if maps is None
+        else [_normalised(value.reshape(B, *value.shape[-2:]).double()).to(dtype) for value in maps]
+    )
+
+
+def _normalised(value: Float64[Tensor, "B h w"]) -> Float64[Tensor, "B h w"]:
+    clean = torch.where((value >= 0) & torch.isfinite(value), value, 0.0)
+    largest = clean.detach().amax((1, 2), keepdim=True)
+    scaled = clean / torch.where(largest > 0, largest, 1.0)  # so that no square overflows; it cancels below
+    square = scaled.square().sum((1, 2), keepdim=True)
+    return scaled * (scaled.sum((1, 2), keepdim=True) / torch.where(square > 0, square, 1.0))
 
 
 def _starts(T_tgt_ref: Tensor | None, B: int, device: torch.device) -> tuple[Tensor, Tensor]:
@@ -196,7 +207,7 @@ def _starts(T_tgt_ref: Tensor | None, B: int, device: torch.device) -> tuple[Ten
         return eye, torch.ones(B, dtype=torch.bool, device=device)
     T = T_tgt_ref.reshape(B, 4, 4).double()
     started = is_pose(T) & (T[:, :3, 3].abs() < MAX_TRANSLATION).all(-1)
-    return torch.where(started[:, None, None], T, eye), started
+    return lie.se3_normalized(torch.where(started[:, None, None], T, eye)), started
 
 
 def _calibrations(intrinsics: Tensor | None, camera: Camera, B: int) -> tuple[Tensor | None, Tensor | None]:

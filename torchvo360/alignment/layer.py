@@ -15,17 +15,17 @@ from torch import Tensor, nn
 
 from torchvo360.agreement import agreeing_share
 from torchvo360.alignment.backward import attach_solution, attach_steps, has_gradient
-from torchvo360.alignment.config import AlignConfig
+from torchvo360.alignment.config import BACKWARD, AlignConfig
 from torchvo360.alignment.inputs import Inputs, Maps, read_inputs
 from torchvo360.alignment.level import free_parameters, match_brightness, solve_level
 from torchvo360.alignment.pyramid import Level, build_levels
 from torchvo360.alignment.result import AlignMaps, AlignResult, LevelHistory
 from torchvo360.backends import linearize
 from torchvo360.cameras import Camera
-from torchvo360.checks import check_choice
+from torchvo360.checks import InputError, check_choice
 from torchvo360.residuals.direct import look_up
 from torchvo360.residuals.weights import weigh
-from torchvo360.solve import Solution, State, Status
+from torchvo360.solve import Solution, State, Status, choose, inverse_ldl
 
 OUTPUTS = ("history", "maps", "information")
 
@@ -79,10 +79,15 @@ def align(
             is none of ours.
     """
     config = AlignConfig() if config is None else config
+    check_choice("backward", config.backward, BACKWARD)
+    outputs = (outputs,) if isinstance(outputs, str) else tuple(outputs)
     for name in outputs:
         check_choice("outputs", name, OUTPUTS)
     inputs = read_inputs(ref, tgt, rho, camera, T_tgt_ref, mask, weight_ref, weight_tgt, rho_variance, intrinsics)
-    with torch.set_grad_enabled(torch.is_grad_enabled() and config.backward != "none"):
+    # Half precision is for networks: sums of a hundred thousand products lose all digits in it.
+    device = inputs.rho.device.type
+    followed = torch.is_grad_enabled() and config.backward != "none"
+    with torch.set_grad_enabled(followed), torch.autocast(device, enabled=False):
         levels = build_levels(inputs, camera, config)
         return _coarse_to_fine(levels, inputs, config, outputs)
 
@@ -93,6 +98,9 @@ class Align(nn.Module):
     def __init__(self, camera: Camera, config: AlignConfig | None = None) -> None:
         """Keep the camera of all images and the settings of all alignments."""
         super().__init__()
+        for name, value, kind in (("camera", camera, Camera), ("config", config, AlignConfig | None)):
+            if not isinstance(value, kind):
+                raise InputError(f"{name}: expected {getattr(kind, '__name__', 'AlignConfig')}, got {value!r}.")
         self.camera = camera
         self.config = AlignConfig() if config is None else config
 
@@ -126,11 +134,14 @@ def _coarse_to_fine(levels: list[Level], inputs: Inputs, config: AlignConfig, ou
     if traced:
         history.append(_history(solution, state[0], inputs.batch))
     status, agreed = _judged(levels[finest], solution, inputs, config)
-    solved = status == int(Status.CONVERGED)
-    if followed and config.backward == "implicit":
-        state = attach_solution(levels[finest], solution.state, solved, config, free)
-    elif followed:
+    if config.backward == "implicit":
+        solved = (status == int(Status.CONVERGED)) & _invertible(solution.equations.H, free)
+        if followed:
+            state = attach_solution(levels[finest], solution.state, solved, config, free)
+    else:
         solved = inputs.started & (status != int(Status.TOO_FEW_PIXELS))
+        if followed:
+            state = choose(solved, state, tuple(part.detach() for part in state))
     T, affine = state
     equations = solution.equations
     if "information" in outputs:
@@ -178,6 +189,12 @@ def _solve(
     return solution, attach_steps(level, state, solution, config, last=last)
 
 
+def _invertible(H: Tensor, free: Tensor) -> Tensor:
+    """Return which undamped H can be inverted, over what is estimated."""
+    eye = torch.eye(len(free), dtype=H.dtype, device=H.device)
+    return inverse_ldl(torch.where(free[:, None] & free, H, eye))[1]
+
+
 @torch.no_grad()
 def _judged(level: Level, solution: Solution, inputs: Inputs, config: AlignConfig) -> tuple[Tensor, Tensor]:
     """Return the final status of every element, and how well its images agree."""
@@ -202,7 +219,7 @@ def _maps(level: Level, T: Tensor, affine: Tensor, config: AlignConfig, batch: t
     seen = (samples.weight > 0).all(1, keepdim=True)
 
     def image(value: Tensor) -> Tensor:
-        return value.reshape(*batch, -1, camera.height, camera.width)
+        return value.reshape(*batch, value.shape[1], camera.height, camera.width)
 
     return AlignMaps(
         residual=image(torch.where(seen, samples.residual, 0.0)),

@@ -16,6 +16,12 @@ from torchvo360.residuals.direct import Reference, Target
 from torchvo360.residuals.normal import NormalEquations
 from torchvo360.solve import Problem, Solution, minimize
 
+MAX_TRANSLATION = 1e6
+"""Positions farther away than this, m, are no place of anything."""
+
+MAX_LOG_GAIN = 10.0
+"""Exposures differ by less than e to this power, fourteen stops."""
+
 
 def match_brightness(reference: Reference, target: Target) -> Float[Tensor, "B 2"]:
     """Return (a, b) that give the reference's values the target's mean and spread, over all that is usable.
@@ -48,6 +54,12 @@ def retract(state: tuple[Tensor, ...], delta: Float[Tensor, "B 8"]) -> tuple[Ten
     return lie.se3_exp(delta[:, :6]) @ T_tgt_ref, affine + delta[:, 6:]
 
 
+def is_sensible(state: tuple[Tensor, ...]) -> Bool[Tensor, "B"]:
+    """Return which states are within any scene and any exposure: unrelated images drive the gain towards zero."""
+    T_tgt_ref, affine = state
+    return (T_tgt_ref[:, :3, 3].abs() < MAX_TRANSLATION).all(-1) & (affine[:, 0].abs() < MAX_LOG_GAIN)
+
+
 def free_parameters(config: AlignConfig, device: torch.device) -> Bool[Tensor, "8"]:
     """Return which of (v, w, a, b) are estimated."""
     return torch.arange(8, device=device) < (8 if config.affine else 6)
@@ -63,7 +75,7 @@ def level_problem(reference: Reference, target: Target, config: AlignConfig, fre
         points, images = (reference, target) if whole else (reference.take(index), target.take(index))
         return linearize(points, images, T, affine, config.loss, noise=config.noise)
 
-    return Problem(evaluate, retract, free)
+    return Problem(evaluate, retract, free, is_sensible)
 
 
 def solve_level(
@@ -112,5 +124,6 @@ def solve_level(
         step_scale=scale,
         free=problem.free,
         min_weight=config.min_pixels,
+        sensible=problem.sensible,
         traced=traced,
     )

@@ -9,7 +9,7 @@ from torch import Tensor
 from torchvo360.alignment.config import AlignConfig
 from torchvo360.alignment.inputs import Inputs
 from torchvo360.cameras import Camera
-from torchvo360.image import blur, level_camera, resample
+from torchvo360.image import blur, blur_radius, level_camera, resample
 from torchvo360.residuals.direct import Reference, Target, make_target
 
 
@@ -57,10 +57,10 @@ def build_levels(inputs: Inputs, camera: Camera, config: AlignConfig) -> list[Le
 def _own_levels(inputs: Inputs, camera: Camera, config: AlignConfig, *, branches: bool) -> list[_Maps]:
     """Smooth and halve the one map that is given."""
     ref, tgt = inputs.ref[0], inputs.tgt[0]
-    known = inputs.known & _eroded(inputs.ref_finite[0], camera, branches=branches)
+    known = inputs.known & _eroded(inputs.ref_finite[0], camera, config.blur_px, branches=branches)
     if config.saturation is not None and ref.shape[1] == 1:
         known = known & (ref[:, 0] < config.saturation)
-    confidence = _confidence(inputs, 0, camera, branches=branches)
+    confidence = _confidence(inputs, 0, camera, config.blur_px, branches=branches)
     weight = None if inputs.weight_ref is None else inputs.weight_ref[0]
     ref, tgt = blur(ref, camera, config.blur_px), blur(tgt, camera, config.blur_px)
     ranges = _Ranges(inputs, known)
@@ -80,7 +80,7 @@ def _given_levels(inputs: Inputs, camera: Camera, *, branches: bool) -> list[_Ma
     for number, (ref, tgt) in enumerate(zip(inputs.ref, inputs.tgt, strict=True)):
         at = camera.resized(ref.shape[-1], ref.shape[-2])
         rho, variance, known = ranges.at(at)
-        confidence = _confidence(inputs, number, at, branches=branches)
+        confidence = _confidence(inputs, number, at, 0.0, branches=branches)
         weight = None if inputs.weight_ref is None else inputs.weight_ref[number]
         levels.append(_Maps(at, ref, tgt, rho, variance, known & inputs.ref_finite[number], weight, confidence))
     return levels
@@ -133,19 +133,20 @@ def _laid_out(maps: _Maps, intrinsics: Tensor | None, whole: Camera, saturation:
     return Level(reference, make_target(maps.tgt, camera, maps.confidence, saturation, k))
 
 
-def _confidence(inputs: Inputs, number: int, camera: Camera, *, branches: bool) -> Tensor | None:
+def _confidence(inputs: Inputs, number: int, camera: Camera, blur_px: float, *, branches: bool) -> Tensor | None:
     """Return the weight of each pixel of the target; None where all count fully."""
     weight = None if inputs.weight_tgt is None else inputs.weight_tgt[number]
     finite = inputs.tgt_finite[number]
     if branches and bool(finite.all()):
         return weight
-    usable = _eroded(finite, camera, branches=branches).to(inputs.tgt[number].dtype)
+    usable = _eroded(finite, camera, blur_px, branches=branches).to(inputs.tgt[number].dtype)
     return usable if weight is None else usable * weight
 
 
-def _eroded(usable: Bool[Tensor, "B H W"], camera: Camera, *, branches: bool) -> Bool[Tensor, "B H W"]:
-    """Drop the pixels beside unusable ones, whose values interpolation and smoothing would mix in."""
+def _eroded(usable: Bool[Tensor, "B H W"], camera: Camera, blur_px: float, *, branches: bool) -> Bool[Tensor, "B H W"]:
+    """Drop the pixels near unusable ones, whose values smoothing by `blur_px` and interpolation would mix in."""
     if branches and bool(usable.all()):
         return usable
-    spoiled = blur((~usable).to(torch.float32), camera, 0.5) > 0
+    reach = 1 + blur_radius(blur_px)
+    spoiled = blur((~usable).to(torch.float32), camera, reach / 3) > 0
     return ~spoiled

@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Float, Float64
 from torch import Tensor
 
-from torchvo360.backends.eager import gram, weighted_rows
+from torchvo360.backends.eager import gram
 from torchvo360.residuals.direct import (
     Reference,
     Samples,
@@ -48,7 +48,7 @@ class OpenLinearization:
 
     def matrix(self) -> Float64[Tensor, "B 8 8"]:
         """Return `linearize`'s H."""
-        return gram(weighted_rows(self.samples, self.weighed, self.t_tgt_ref)[:, :8])
+        return gram(self.samples, self.weighed, self.t_tgt_ref)[:, :8, :8]
 
     def pull(self, direction: Float[Tensor, "B 8"]) -> Float64[Tensor, "B"]:
         """Return `linearize`'s g along a direction."""

@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 import torch
+import torch.nn.functional as F
 from jaxtyping import Float, Float64
 from torch import Tensor
 
@@ -29,6 +30,9 @@ CHUNK_SAMPLES = 49152
 
 SUM_SAMPLES = 2048
 """Samples summed in the dtype of the rows before float64 takes over: errors of a float32 H stay near 1e-7, not 1e-6."""
+
+ALIGNED = 16
+"""Numbers of samples are brought to a multiple of this, by zeros."""
 
 
 def linearize(
@@ -57,10 +61,10 @@ def linearize(
         for points, images, T, ab in chunks:
             samples = look_up(points, images, T, ab)
             weighed = weigh(samples, points, T[:, :3, 3], loss, noise)
-            S = weighted_rows(samples, weighed, T[:, :3, 3])
+            M = gram(samples, weighed, T[:, :3, 3])
             cost = (samples.weight * weighed.cost).sum((1, 2)).double()
             weight = samples.weight.sum((1, 2)).double() * (C / samples.weight.shape[1])
-            parts.append((gram(S), cost, weight))
+            parts.append((M, cost, weight))
         groups.append([torch.stack(column).sum(0) for column in zip(*parts, strict=True)])
     M, cost, total = (torch.cat(column) for column in zip(*groups, strict=True))
     return NormalEquations(M[:, :8, :8], M[:, :8, 8], cost, total, M[:, 8, 8])
@@ -79,7 +83,8 @@ def _divided(reference: Reference, target: Target, T_tgt_ref: Tensor, affine: Te
 
     def chunks(pairs: slice) -> Iterator[Part]:
         points, images, T_group, ab_group = reference, target, T, ab
-        if group < B:
+        # Under autograd the chunks' gradients are summed here first, in one order whatever part of a batch this is.
+        if group < B or torch.is_grad_enabled():
             points, images, T_group, ab_group = reference.take(pairs), target.take(pairs), T[pairs], ab[pairs]
         for start in range(0, max(N, 1), most):
             yield (points if most >= N else points.chunk(start, min(start + most, N))), images, T_group, ab_group
@@ -88,30 +93,35 @@ def _divided(reference: Reference, target: Target, T_tgt_ref: Tensor, affine: Te
         yield chunks(slice(first, first + group))
 
 
-def weighted_rows(samples: Samples, weighed: Weighed, t_tgt_ref: Float[Tensor, "B 3"]) -> Float[Tensor, "B 9 M"]:
-    """Return the Jacobian's eight columns and the residual, all times the roots of their weights."""
-    root = _root(samples.weight * weighed.weight)
+def gram(samples: Samples, weighed: Weighed, t_tgt_ref: Float[Tensor, "B 3"]) -> Float64[Tensor, "B 9 9"]:
+    """Return `S W S^T` of the Jacobian's eight columns and the residual."""
+    W = samples.weight * weighed.weight
+    if torch.is_grad_enabled():
+        # Without the roots, whose slope is infinite where a weight is zero.
+        S = _rows(samples, weighed, t_tgt_ref, torch.ones_like(W))
+        return _product(S * W.flatten(1)[:, None], S)
+    S = _rows(samples, weighed, t_tgt_ref, W.sqrt())
+    return _product(S, S)
+
+
+def _rows(samples: Samples, weighed: Weighed, t_tgt_ref: Tensor, root: Tensor) -> Float[Tensor, "B 9 M"]:
     S = system_rows(samples, root)
     if weighed.slope is not None:
         S[:, :6] += weight_slope_rows(samples, weighed.slope * samples.residual * root, t_tgt_ref)
     return S
 
 
-def gram(S: Float[Tensor, "B 9 M"]) -> Float64[Tensor, "B 9 9"]:
-    """Return `S S^T`, summed block by block."""
+def _product(A: Float[Tensor, "B 9 M"], S: Float[Tensor, "B 9 M"]) -> Float64[Tensor, "B 9 9"]:
+    """Return `A S^T`, summed block by block."""
+    if S.shape[2] % ALIGNED:
+        # An element's rows begin at a multiple of 64 bytes wherever it stands in a batch: products depend on that.
+        A, S = (F.pad(x, (0, -x.shape[2] % ALIGNED)) for x in (A, S))
     blocks = S.shape[2] // SUM_SAMPLES
     if blocks < 2 or not len(S):
-        return torch.bmm(S, S.mT).double()
+        return torch.bmm(A, S.mT).double()
     # Element by element: the blocks of one are a view, those of all would be a copy.
-    whole = S[..., : blocks * SUM_SAMPLES].unflatten(2, (blocks, SUM_SAMPLES)).transpose(1, 2)
-    total = torch.stack([torch.bmm(part, part.mT).sum(0, dtype=torch.float64) for part in whole])
-    rest = S[..., blocks * SUM_SAMPLES :]
-    return total + torch.bmm(rest, rest.mT) if rest.shape[2] else total
-
-
-def _root(weight: Float[Tensor, "B C N"]) -> Float[Tensor, "B C N"]:
-    """Return the square root, with a zero gradient at zero, where the bare root's is infinite."""
-    if not weight.requires_grad:
-        return weight.sqrt()
-    positive = weight > 0
-    return torch.where(positive, weight, 1.0).sqrt() * positive
+    whole = slice(0, blocks * SUM_SAMPLES)
+    left, right = (x[..., whole].unflatten(2, (blocks, SUM_SAMPLES)).transpose(1, 2) for x in (A, S))
+    total = torch.stack([torch.bmm(a, b.mT).sum(0, dtype=torch.float64) for a, b in zip(left, right, strict=True)])
+    rest = slice(blocks * SUM_SAMPLES, None)
+    return total + torch.bmm(A[..., rest], S[..., rest].mT) if S.shape[2] > blocks * SUM_SAMPLES else total

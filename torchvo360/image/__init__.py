@@ -2,7 +2,7 @@
 
 from torchvo360.image.covector import covector_field, gradient, gradient_magnitude
 from torchvo360.image.padding import pad_image
-from torchvo360.image.pyramid import blur, level_camera, masked_pyramid, pyramid, resample
+from torchvo360.image.pyramid import blur, blur_radius, level_camera, masked_pyramid, pyramid, resample
 from torchvo360.image.sampling import Interpolated, Taps, interpolate, locate, sample
 from torchvo360.image.selection import equal_area_cells, select_pixels
 
@@ -10,6 +10,7 @@ __all__ = [
     "Interpolated",
     "Taps",
     "blur",
+    "blur_radius",
     "covector_field",
     "equal_area_cells",
     "gradient",

@@ -9,16 +9,27 @@ from torch import Tensor
 from torchvo360.cameras import Camera
 from torchvo360.image.padding import pad_image
 
+SMALL_PLANE = 2**16
+"""Pixels of an image below which torch convolves one alone in another way than several."""
+
 
 def blur(image: Float[Tensor, "*batch H W"], camera: Camera, sigma_px: float) -> Float[Tensor, "*batch H W"]:
     """Smooth by a Gaussian of `sigma_px` pixels, around the seam and over the poles; 0 leaves the image as it is."""
     if sigma_px <= 0:
         return image
-    radius = max(1, round(3 * sigma_px))
+    radius = blur_radius(sigma_px)
     kernel = get_gaussian_kernel1d(2 * radius + 1, sigma_px, dtype=image.dtype, device=image.device)[0]
     padded = pad_image(image, camera, radius).reshape(-1, 1, camera.height + 2 * radius, camera.width + 2 * radius)
-    vertical = F.conv2d(padded, kernel.reshape(1, 1, -1, 1))
-    return F.conv2d(vertical, kernel.reshape(1, 1, 1, -1)).reshape(image.shape)
+    alone = len(padded) == 1 and padded.numel() < SMALL_PLANE
+    # A small image alone takes another path in torch, and comes out with other last digits: let it have company.
+    vertical = F.conv2d(padded.expand(2, -1, -1, -1) if alone else padded, kernel.reshape(1, 1, -1, 1))
+    smooth = F.conv2d(vertical, kernel.reshape(1, 1, 1, -1))
+    return (smooth[:1] if alone else smooth).reshape(image.shape)
+
+
+def blur_radius(sigma_px: float) -> int:
+    """Return how many pixels `blur` reaches to each side."""
+    return max(1, round(3 * sigma_px)) if sigma_px > 0 else 0
 
 
 def level_camera(camera: Camera, level: int) -> Camera:

@@ -154,7 +154,12 @@ def look_up(
     rho, T_tgt_ref = reference.rho.view_as(reference.rho), T_tgt_ref.view_as(T_tgt_ref)
     k, k_of_channels = _broadcast(target.intrinsics)
     R, t = T_tgt_ref[:, :3, :3], T_tgt_ref[:, :3, 3:]
-    Y = torch.baddbmm(t * rho[:, None], R, reference.ray.expand(R.shape[0], -1, -1))
+    if T_tgt_ref.requires_grad:
+        # The derivative of a matrix product depends on where in memory an element of a batch begins.
+        x, y, z = reference.ray[:, None].unbind(2)
+        Y = t * rho[:, None] + R[:, :, :1] * x + R[:, :, 1:2] * y + R[:, :, 2:] * z
+    else:
+        Y = torch.baddbmm(t * rho[:, None], R, reference.ray.expand(R.shape[0], -1, -1))
     camera = target.camera
     weight = reference.weight
     if not camera.wraps:

@@ -5,7 +5,7 @@ from torchvo360.solve.implicit import Stationarity, attach_implicit, attach_newt
 from torchvo360.solve.linear import inverse_ldl, solve_ldl
 from torchvo360.solve.lm import Solution, minimize
 from torchvo360.solve.status import Status
-from torchvo360.solve.step import Problem, State
+from torchvo360.solve.step import Problem, State, choose
 from torchvo360.solve.trace import Trace, last_moves, replay
 
 __all__ = [
@@ -18,6 +18,7 @@ __all__ = [
     "Trace",
     "attach_implicit",
     "attach_newton_step",
+    "choose",
     "inverse_ldl",
     "last_moves",
     "minimize",

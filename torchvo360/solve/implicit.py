@@ -119,7 +119,8 @@ class _Implicit(torch.autograd.Function):
         saved, count = ctx.saved_tensors, ctx.count
         again = torch.is_grad_enabled()  # only then is this pass to be differentiated itself
         wanted = ctx.needs_input_grad[2 + count :]
-        with torch.enable_grad():
+        device = saved[0].device.type
+        with torch.enable_grad(), torch.autocast(device, enabled=False):
             if again:
                 # Aliases: the derivative is by the parameters alone, not by way of the solution that depends on them.
                 state, parameters = saved[:count], tuple(part.view_as(part) for part in saved[count:])

@@ -42,6 +42,7 @@ def minimize(
     step_scale: Float[Tensor, "B D"],
     free: Bool[Tensor, "D"],
     min_weight: float,
+    sensible: Callable[[State], Bool[Tensor, "A"]] | None = None,
     traced: bool = False,
 ) -> Solution:
     """Minimise every element of a batch from its own start.
@@ -54,12 +55,13 @@ def minimize(
         step_scale: Turns a step into comparable units, in which `config.step_tolerance` counts.
         free: Parameters to be estimated; the others stay as they are.
         min_weight: Elements whose samples weigh less in all end as TOO_FEW_PIXELS.
+        sensible: Which states may be gone to; all that are finite by default.
         traced: Whether every step is noted.
 
     Returns:
         States, equations, status and steps of all elements; what ended badly keeps its best state.
     """
-    problem = Problem(linearize, retract, free)
+    problem = Problem(linearize, retract, free, sensible)
     place = torch.arange(state[0].shape[0], device=state[0].device)
     equations = linearize(state, place)
     enough = equations.weight >= min_weight

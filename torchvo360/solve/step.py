@@ -17,6 +17,9 @@ from torchvo360.solve.status import Status
 State = tuple[Tensor, ...]
 """Parameters, each with the batch as its first axis."""
 
+COST_ROUNDING = 1e-7
+"""A refused step that promised less than this share of the cost was refused by the rounding of float32 sums."""
+
 GOING_ON = -1
 """In place of a status: the element has not ended."""
 
@@ -31,6 +34,8 @@ class Problem:
     """Applies tangent steps to states."""
     free: Bool[Tensor, "D"]
     """Parameters to be estimated; the others stay as they are."""
+    sensible: Callable[[State], Bool[Tensor, "A"]] | None = None
+    """Which states may be gone to; all that are finite by default."""
 
 
 class Work(NamedTuple):
@@ -103,11 +108,14 @@ def damped_step(
 
 
 def propose(problem: Problem, work: Work) -> Proposal:
-    """Return the damped Gauss-Newton step of every element; where it leads to what is not finite, the state itself."""
+    """Return the damped Gauss-Newton step of every element; where it leads to nothing sensible, the state itself."""
     H, g, delta, solvable = damped_step(work.equations, work.damping.value, problem.free)
     candidate = problem.retract(work.state, delta)
     finite = torch.stack([torch.isfinite(part).flatten(1).all(1) for part in candidate]).all(0)
-    return Proposal(H, g, delta, solvable, choose(finite, candidate, work.state))
+    candidate = choose(finite, candidate, work.state)
+    if problem.sensible is not None:
+        candidate = choose(problem.sensible(candidate), candidate, work.state)
+    return Proposal(H, g, delta, solvable, candidate)
 
 
 def has_arrived(proposal: Proposal, work: Work, scale: Float[Tensor, "A D"], config: LMConfig) -> Bool[Tensor, "A"]:
@@ -129,7 +137,8 @@ def judge(proposal: Proposal, work: Work, proposed: NormalEquations, config: LMC
     gained = cost - proposed_cost
     accepted = proposal.solvable & torch.isfinite(proposed_cost) & (proposed.weight >= min_weight) & (gained > 0)
 
-    little = torch.where(accepted, gained, promised) <= config.cost_tolerance * cost
+    least = max(config.cost_tolerance, COST_ROUNDING)
+    little = torch.where(accepted, gained <= config.cost_tolerance * cost, promised <= least * cost)
     # Under heavy damping every step promises little: that is no sign of a minimum.
     converged = proposal.solvable & little & (accepted | (promised >= 0)) & (damping.value <= 1)
     singular = ~proposal.solvable & (damping.value >= 1)

@@ -21,7 +21,7 @@ pairs = sample_pairs(6, seed=77, width=128, height=64, world="courtyard", affine
 axis = torch.nn.functional.normalize(torch.randn(6, 3, generator=torch.Generator().manual_seed(0)).double(), dim=-1)
 away = lie.se3(lie.so3_exp(math.radians(120) * axis), torch.zeros(6, 3, dtype=torch.float64))
 start = away @ pairs.T_tgt_ref_true
-network = load_checkpoint(SHIPPED_FEATURES).eval()
+network = load_checkpoint(SHIPPED_FEATURES)
 
 
 def found(T: Tensor, status: Tensor) -> str:

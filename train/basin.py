@@ -21,7 +21,8 @@ from basin_report import BOTH, OTHER, ROTATION, SAME, TRANSLATION, Row, report_b
 from illumination import IlluminationConfig, relit
 from pairs import PairsConfig, ViewPairs, displaced, median_range, render_pairs, turned
 from torchvo360 import AlignConfig, align
-from torchvo360.checks import InputError
+from torchvo360.checks import InputError, check_choice
+from torchvo360.data.synthetic import WORLDS
 from torchvo360.learn import FeaturePyramid, load_checkpoint
 from torchvo360.learn.features import (
     COARSE,
@@ -65,6 +66,20 @@ class BasinConfig:
     """Errors of starts that are wrong by 2 cm for each degree besides."""
     coarsest_widths: list[int] = field(default_factory=lambda: [64, 32, 16])
     """`AlignConfig.coarsest_width` of intensity, of which the best is taken at every point."""
+
+    def __post_init__(self) -> None:
+        for kind in self.kinds:
+            check_choice("kinds", kind, WORLDS)
+        if (
+            not self.kinds
+            or not self.coarsest_widths
+            or not (self.rotations_deg or self.translations_m or self.both_deg)
+        ):
+            raise InputError(
+                "basin: expected at least one kind, one coarsest width and one error of a start, got none."
+            )
+        if self.pairs < 1:
+            raise InputError(f"pairs: expected at least 1, got {self.pairs}.")
 
     def scans(self) -> Iterator[tuple[str, float, float, float]]:
         """Yield what is displaced, by how much, and that in degrees and metres."""
@@ -171,6 +186,7 @@ def main(argv: list[str] | None = None) -> int:
     """Measure a checkpoint and write basin.csv, basin.md and basin.png; return the exit code."""
     parser = argparse.ArgumentParser("train/basin.py", description="Measure basins of convergence.")
     parser.add_argument("--checkpoint", required=True, type=Path, help="a .safetensors with its .json beside it")
+    parser.add_argument("--target", help="dotted name of the network's class, where it is not one of the package's")
     parser.add_argument("--out", type=Path, default=Path("runs/basin"), help="folder of the results (%(default)s)")
     parser.add_argument("--pairs", type=int, default=BasinConfig.pairs, help="pairs of each kind (%(default)s)")
     parser.add_argument("--kinds", nargs="+", default=BasinConfig().kinds, help="kinds of worlds (%(default)s)")
@@ -180,7 +196,7 @@ def main(argv: list[str] | None = None) -> int:
     try:
         torch.set_num_threads(arguments.threads)
         config = BasinConfig(kinds=arguments.kinds, pairs=arguments.pairs, seed=arguments.seed)
-        network = load_checkpoint(arguments.checkpoint)
+        network = load_checkpoint(arguments.checkpoint, arguments.target)
         arguments.out.mkdir(parents=True, exist_ok=True)
         lines = report_basin(arguments.out, measure_basin(network, config, IlluminationConfig()))
     except InputError as error:

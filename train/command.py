@@ -17,10 +17,11 @@ from typing import Any
 import cv2
 import torch
 
-from settings import TrainingConfig, command_of, compose, to_yaml, write_settings
+from settings import SETTINGS, TrainingConfig, command_of, compose, to_yaml, write_settings
 from sweep import run_sweep
 from torchvo360.checks import InputError
 from torchvo360.cli.command import conf_folder
+from torchvo360.files import write_atomically
 from torchvo360.learn import Ending, TrainOutcome
 from torchvo360.learn.trainer import CHECKPOINTS, Experiment, train
 from torchvo360.outputs import new_folder
@@ -93,9 +94,7 @@ def _train(name: str, config: TrainingConfig, run: Run, command: str) -> int:
     with _folder(name, config) as folder:
 
         def train_here(experiment: Experiment) -> TrainOutcome:
-            if is_first():
-                write_settings(folder, config, command)
-            with _stop_signals() as stop:
+            with _settings_in(folder, config, command), _stop_signals() as stop:
                 outcome = train(
                     experiment,
                     config.trainer,
@@ -117,6 +116,25 @@ def _train(name: str, config: TrainingConfig, run: Run, command: str) -> int:
         print(f"train/{name}.py: training: expected finite losses and gradients, got {got}.", file=sys.stderr)
         return 1
     return 128 + received if outcome.ending is Ending.STOPPED and received else 0
+
+
+@contextmanager
+def _settings_in(folder: Path, config: TrainingConfig, command: str) -> Iterator[None]:
+    """Write the settings into a training's folder; where the training is refused, they are as they were before."""
+    if not is_first():
+        yield
+        return
+    path = folder / SETTINGS
+    before = path.read_bytes() if path.exists() else None
+    write_settings(folder, config, command)
+    try:
+        yield
+    except InputError:
+        if before is None:
+            path.unlink()
+        else:
+            write_atomically(path, before)
+        raise
 
 
 def _stop_signals() -> StopSignals:
@@ -158,4 +176,7 @@ def _folder(name: str, config: TrainingConfig) -> Iterator[Path]:
         if not (config.resume or config.overwrite) and any((folder / name).exists() for name in CHECKPOINTS):
             expected = "a folder without a training, resume=true or overwrite=true"
             raise InputError(f"out: expected {expected}, got {folder}, which holds one.")
+        settings = folder / SETTINGS
+        if not config.resume and settings.exists() and not settings.read_bytes().startswith(b"# python "):
+            raise InputError(f"out: expected a new folder or a training's, got {folder}, which is that of another run.")
         yield folder

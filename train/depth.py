@@ -5,12 +5,11 @@ python train/depth.py mode=neighbours       without them: photometric, with the 
 python train/depth.py -c                    all settings
 """
 
-import os
 import sys
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from command import Train, TrainingConfig, main
+from command import Train, TrainingConfig, is_first, main
 from odometry import WalksConfig, figures_of, walk_through, write_walks
 from ranges import Neighbours, NeighboursConfig, Ranges, TrueRanges
 from torchvo360.checks import InputError, check_choice, check_finite_number
@@ -70,7 +69,7 @@ def experiment(config: DepthTraining) -> Ranges:
     """
     module = PanoramaDepth(config.network.width, config.network.channels)
     if config.start is not None:
-        learned = load_checkpoint(config.start)
+        learned = load_checkpoint(Path(config.start).expanduser())
         if not isinstance(learned, PanoramaDepth):
             raise InputError(f"start: expected a checkpoint of PanoramaDepth, got {type(learned).__name__}.")
         module = learned
@@ -83,7 +82,7 @@ def experiment(config: DepthTraining) -> Ranges:
 def run(config: DepthTraining, folder: Path, train: Train) -> list[str]:
     """Train, and try the best network in the odometry; its figures go into the checkpoint."""
     outcome = train(experiment(config))
-    if not outcome.success or not config.walks.frames or os.environ.get("RANK", "0") != "0":
+    if not outcome.success or not config.walks.frames or not is_first():
         return []
     network = load_checkpoint(outcome.checkpoint)
     walks = walk_through(network, config.walks)

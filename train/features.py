@@ -73,6 +73,8 @@ class FeaturesConfig(TrainingConfig):
                 "unchanged, harder_steps, validation_pairs: expected a share and two numbers of at least 1, "
                 f"got {self.unchanged}, {self.harder_steps} and {self.validation_pairs}."
             )
+        if not self.steps_by_level or min(self.steps_by_level) < 1:
+            raise InputError(f"steps_by_level: expected positive numbers of steps, got {self.steps_by_level}.")
         for name in ("start_rotation_deg", "start_translation_m"):
             if len(getattr(self, name)) != 2 or min(getattr(self, name)) < 0:
                 raise InputError(f"{name}: expected two numbers of at least 0, got {getattr(self, name)}.")

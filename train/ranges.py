@@ -87,10 +87,13 @@ class Ranges:
         index = torch.randint(len(self.views), (size,), generator=generator)
         shift = torch.randint(self.camera.width, (size,), generator=generator)
         mirrored = torch.rand(size, generator=generator) < 0.5
-        share = torch.tensor(self.trainer.share(part, parts))
-        chosen = turned(self.views.take(index[share].tolist()), shift[share], mirrored[share])
-        own = torch.Generator().manual_seed(seed * 1024 + part)
-        return repainted(chosen.image, self.appearance, own), chosen.rho
+        chosen = turned(self.views.take(index.tolist()), shift, mirrored)
+        paint = torch.Generator().manual_seed(seed * 1024)
+        image = repainted(chosen.image, self.appearance, paint)
+        # All of the batch is drawn by every process: then the joint batch does not depend on their number.
+        share = self.trainer.share(part, parts)
+        mine = slice(share.start, share.stop)
+        return image[mine], chosen.rho[mine]
 
     def losses(self, module: nn.Module, batch: tuple[Tensor, Tensor]) -> dict[str, Tensor]:
         """Return what is minimised as `loss`, and its parts."""
@@ -203,7 +206,7 @@ class Neighbours(Ranges):
         """Return how unlike each view its neighbours look, the likelihood of the rest, and the share of good poses."""
         count, camera = image.shape[1] - 1, self.camera
         ref, tgt = image[:, :1].expand(-1, count, -1, -1, -1), image[:, 1:]
-        rho = log_rho.exp()[:, None].expand(-1, count, -1, -1)
+        rho = log_rho.float().exp()[:, None].expand(-1, count, -1, -1)  # autocast may have halved it
         found = align(ref.mean(2, keepdim=True), tgt.mean(2, keepdim=True), rho, camera, config=self._align)
         view, neighbour, rho, T_tgt_ref = (part.flatten(0, 1) for part in (ref, tgt, rho, found.T_tgt_ref))
         seen = warped(neighbour, rho, T_tgt_ref, camera)

@@ -1,7 +1,7 @@
 """The settings of a training: Hydra composes conf/train upon its dataclass, and its complaints become sentences."""
 
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -17,9 +17,16 @@ from torchvo360.cli import overrides as overrides_of
 from torchvo360.cli.overrides import to_yaml
 from torchvo360.files import write_atomically
 from torchvo360.learn import TrainerConfig
+from torchvo360.learn.plugin import TARGET
 
 SETTINGS = "config.yaml"
 """The settings of a training in its folder, which `resume=true` starts from."""
+
+OF_THE_CALL = {"out", "resume", "overwrite"}
+"""Keys that say what a call does, and nothing about the training."""
+
+LITERAL = ("out", "start")
+"""Keys whose value is taken as it stands: brackets, commas and equal signs are common in names of files."""
 
 
 @dataclass(kw_only=True)
@@ -57,7 +64,7 @@ def compose(name: str, schema: type[TrainingConfig], overrides: Sequence[str], c
     Raises:
         InputError: A key or a value is not one of ours, or there is no training to resume.
     """
-    overrides = [overrides_of.literal(text) if text.startswith("out=") else text for text in overrides]
+    overrides = [overrides_of.literal(text) if text.partition("=")[0] in LITERAL else text for text in overrides]
     check_keys(schema, overrides)
     with hydra_ready(schema, conf):
         config = composed(name, hydra.compose, overrides)
@@ -122,10 +129,25 @@ def _resumed(schema: type, config: DictConfig, overrides: Sequence[str]) -> Dict
         raise InputError(f"out: expected a folder with a training to resume, got {config.out}.") from None
     except (YAMLError, UnicodeDecodeError):
         raise InputError(f"out: expected settings in {path}, got a damaged file.") from None
-    merged = OmegaConf.merge(OmegaConf.structured(schema), before)
+    if not isinstance(before, DictConfig):
+        raise InputError(f"out: expected settings in {path}, got a damaged file.")
+    kept = {key: value for key, value in before.items() if key not in OF_THE_CALL}
+    merged = OmegaConf.merge(OmegaConf.structured(schema), kept)
     assert isinstance(merged, DictConfig)
-    for text in overrides:
-        key = text.partition("=")[0].lstrip("+")
+    given = {text.partition("=")[0].lstrip("+") for text in overrides}
+    for key in sorted(given):
         if not key.startswith(("hydra", "cluster")):
             OmegaConf.update(merged, key, OmegaConf.select(config, key))
+    for key, name in _named_classes(merged):
+        if key not in given and not name.startswith("torchvo360.learn."):
+            expected = "to be given again, as a folder's settings are not trusted to name a class"
+            raise InputError(f"{key}: expected {expected}, got {name} from {path}.")
     return merged
+
+
+def _named_classes(node: DictConfig, path: str = "") -> Iterator[tuple[str, str]]:
+    for key, child in node.items():
+        if key == TARGET and child is not None:
+            yield f"{path}{key}", str(child)
+        elif isinstance(child, DictConfig):
+            yield from _named_classes(child, f"{path}{key}.")

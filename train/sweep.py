@@ -48,6 +48,9 @@ def run_sweep(name: str, schema: type, overrides: Sequence[str], conf: Path) -> 
             batches = composed(name, hydra.multirun, arguments, task_function=job, with_log_configuration=False)
         except SystemExit as stopped:
             return cast("int", stopped.code)
+        finally:
+            if not any(path.is_dir() for path in folder.iterdir()):  # no job left anything
+                (folder / "multirun.yaml").unlink(missing_ok=True)
         print(f"results: {folder}")
         return max(job.return_value for batch in batches for job in batch)
 

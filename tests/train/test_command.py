@@ -14,6 +14,8 @@ import yaml
 from toy_training import ToyConfig, run
 
 from command import main
+from features import FeaturesConfig
+from features import run as features_run
 from torchvo360.learn.checkpoint import read_config, read_tensors
 
 ROOT = Path(__file__).parents[2]
@@ -85,6 +87,40 @@ def test_overwriting_begins_anew(toy, tmp_path):
     assert toy("out=second", "trainer.seed=2") == 0
     assert toy("out=second", "trainer.seed=1", "overwrite=true") == 0
     assert_same_network(tmp_path / "first", tmp_path / "second")
+
+
+def test_a_training_begun_by_overwriting_can_be_resumed(toy, tmp_path):
+    assert toy("out=run", "trainer.steps=2", "overwrite=true") == 0
+    assert toy("out=run", "resume=true", "trainer.steps=3") == 0
+    assert read_config(tmp_path / "run" / "last")["figures"]["steps"] == 3
+
+
+def test_a_refused_call_leaves_the_settings_as_they_were(toy, tmp_path, capsys):
+    assert toy("out=run", "trainer.steps=2") == 0
+    before = (tmp_path / "run" / "config.yaml").read_bytes()
+    assert toy("out=run", "resume=true", "trainer.steps=5", "trainer.watch=nonsense") == 2
+    assert (tmp_path / "run" / "config.yaml").read_bytes() == before
+    assert toy("out=run", "resume=true", "trainer.steps=3") == 0
+
+
+def test_a_run_of_the_command_is_not_written_over(toy, tmp_path, capsys):
+    (tmp_path / "walk").mkdir()
+    (tmp_path / "walk" / "config.yaml").write_text("input: walk.mp4\n")
+    assert toy("out=walk") == 2
+    assert "another run" in capsys.readouterr().err
+    assert (tmp_path / "walk" / "config.yaml").read_text() == "input: walk.mp4\n"
+
+
+def test_a_folder_to_resume_is_not_trusted_to_name_a_class(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "stranger").mkdir()
+    given = "# python train/features.py\nfeatures:\n  _target_: os.mkdir\n  path: broken_in\n"
+    (tmp_path / "stranger" / "config.yaml").write_text(given)
+    assert main("features", FeaturesConfig, features_run, ["out=stranger", "resume=true"]) == 2
+    said = capsys.readouterr().err
+    assert said.startswith("train/features.py: features._target_: expected to be given again")
+    assert "os.mkdir" in said
+    assert not (tmp_path / "broken_in").exists()
 
 
 def test_a_training_that_diverges_says_so_and_fails(toy, capsys):

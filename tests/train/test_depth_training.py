@@ -111,9 +111,10 @@ def test_a_batch_is_a_function_of_its_step_whatever_came_before():
 
 def test_processes_share_a_batch():
     experiment = TrueRanges(*parts(1), common_error=1.0)
-    whole = experiment.batch(3, 0, 1)[1]
-    shares = [experiment.batch(3, part, 2)[1] for part in range(2)]
-    assert torch.equal(torch.cat(shares), whole)
+    whole = experiment.batch(3, 0, 1)
+    shares = zip(*(experiment.batch(3, part, 2) for part in range(2)), strict=True)
+    for joint, parts_of_it in zip(whole, shares, strict=True):
+        assert torch.equal(torch.cat(parts_of_it), joint)
 
 
 # Learning

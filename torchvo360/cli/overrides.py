@@ -88,7 +88,9 @@ def explained(function: Callable[..., Any], config_name: str, overrides: Sequenc
             expected = "one value (or a list [...], or -m for a sweep)"
             raise InputError(f"{swept[1]}: expected {expected}, got {swept[2]}.") from None
         if foreign := re.match(r"Could not override '(.*?)'", text):
-            raise InputError(f"{foreign[1]}: expected a key that Hydra knows, got another one.") from None
+            raise InputError(
+                f"{foreign[1]}: expected a known key, or +{foreign[1]}=... to add one, got neither."
+            ) from None
         cause = str(error.__cause__ or error).partition("\n")[0].rstrip(".")
         if not (override := text.partition("Error merging override ")[2]):
             raise InputError(f"settings: expected what Hydra can compose, got its refusal: {cause}.") from None

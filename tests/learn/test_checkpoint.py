@@ -47,7 +47,7 @@ def json_of(path: Path) -> Path:
 
 
 @pytest.mark.parametrize("suffix", ["", ".safetensors", ".json"])
-@pytest.mark.parametrize("target", [toy_module, "toy_experiment.toy_module"])
+@pytest.mark.parametrize("target", [toy_module, "toy_experiment.ToyNet"])
 def test_a_saved_network_comes_back_bit_for_bit_ready_to_use(saved, suffix, target):
     module = load_checkpoint(saved.with_name(saved.name + suffix), target)
     assert not module.training
@@ -200,6 +200,48 @@ def test_tensors_that_do_not_fit_are_told(saved, change, sentence):
     save_checkpoint(saved, Other(), CONFIG)
     with pytest.raises(InputError, match=f"^checkpoint: {sentence}$"):
         load_checkpoint(saved, toy_module)
+
+
+@pytest.mark.parametrize("dtype", [torch.float8_e4m3fn, torch.float8_e5m2, torch.complex64, torch.bool])
+def test_numbers_of_another_kind_are_told(tmp_path, dtype):
+    class Other(nn.Module):
+        def state_dict(self):
+            return {"weight": torch.ones(3, 2).to(dtype), "bias": torch.ones(3)}
+
+    save_checkpoint(tmp_path / "net", Other(), {"_target_": "torch.nn.Linear", "in_features": 2, "out_features": 3})
+    with pytest.raises(InputError, match=r"^checkpoint: expected weight to be .*, got \[3, 2\] of .* in .*\.$"):
+        load_checkpoint(tmp_path / "net", nn.Linear)
+
+
+def test_a_network_of_eight_bits_is_told(tmp_path):
+    network = nn.Linear(2, 3).to(torch.float8_e4m3fn)
+    save_checkpoint(tmp_path / "net", network, {"_target_": "torch.nn.Linear", "in_features": 2, "out_features": 3})
+    with pytest.raises(InputError, match=r"^checkpoint: expected 16 bits or more a number, got .*float8.*\.$"):
+        load_checkpoint(tmp_path / "net", lambda **arguments: nn.Linear(**arguments).to(torch.float8_e4m3fn))
+
+
+@pytest.mark.parametrize("path", ["", ".", "/", "./", ".."])
+def test_a_path_that_names_no_file_is_told(path):
+    with pytest.raises(InputError, match=r"^checkpoint: expected .*\.$"):
+        load_checkpoint(path, toy_module)
+
+
+@pytest.mark.parametrize(
+    ("name", "arguments"),
+    [
+        ("depth.PanoramaDepth", {"width": 2**70}),
+        ("depth.PanoramaDepth", {"channels": [2**70]}),
+        ("depth.PanoramaDepth", {"channels": [8] * 10**5}),
+        ("features.PanoramaFeatures", {"widths": [2**70], "channels": [1]}),
+        ("features.PanoramaFeatures", {"widths": [8], "channels": [2**70]}),
+        ("features.PanoramaFeatures", {"widths": [8] * 10**5, "channels": [8] * 10**5}),
+        ("features.PanoramaFeatures", {"spread_deg": [15.0] * 10**5}),
+    ],
+)
+def test_sizes_beyond_all_use_are_told_before_anything_is_made(saved, name, arguments):
+    json_of(saved).write_text(json.dumps({"_target_": f"torchvo360.learn.{name}", **arguments}))
+    with pytest.raises(InputError, match=r"^checkpoint\.[\w, ]+: expected .*, got .{1,200}\.$"):
+        load_checkpoint(saved)
 
 
 def test_arguments_that_the_class_refuses_are_told(saved):

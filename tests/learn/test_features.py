@@ -117,7 +117,7 @@ def test_other_numbers_of_channels_are_refused(network):
     [
         ({"widths": (16, 24)}, "widths, channels"),
         ({"widths": (6, 24, 32, 48)}, "widths, channels"),
-        ({"channels": (0, 1, 2, 3)}, "channels: expected at least 1"),
+        ({"channels": (0, 1, 2, 3)}, "channels: expected 1 to 1024 each"),
         ({"spread_deg": (2.0,)}, "spread_deg"),
     ],
 )

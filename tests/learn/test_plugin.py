@@ -12,6 +12,7 @@ from torchvo360.learn import (
     DepthEstimator,
     FeatureExtractor,
     FeaturePyramid,
+    NonFiniteError,
     RangeEstimate,
     build,
     checked_features,
@@ -95,8 +96,8 @@ def test_a_good_answer_passes_unchanged_and_keeps_its_gradient():
             {"_target_": "broken_module.Net"},
             "features._target_: expected an importable class, got broken_module.Net (Zer",
         ),
-        ({"_target_": "math.pi"}, "features._target_: expected a class, got math.pi, a float."),
-        ({"_target_": "builtins.dict"}, "features._target_: expected builtins.dict to make an nn.Module, got dict."),
+        ({"_target_": "math.pi"}, "features._target_: expected a subclass of torch.nn.Module, got math.pi, a float."),
+        ({"_target_": "builtins.dict"}, "features._target_: expected a subclass of torch.nn.Module, got builtins.dict"),
         (
             {"_target_": "torch.nn.ReLU", "size": 3},
             "features: expected arguments that torch.nn.ReLU accepts, got size (",
@@ -117,6 +118,14 @@ def test_what_cannot_be_made_is_refused_in_one_sentence(spec, sentence, tmp_path
     assert str(refused.value).endswith(".")
     assert "\n" not in str(refused.value)
     assert "broken_module" not in sys.modules
+
+
+@pytest.mark.parametrize("name", ["os.mkdir", "pathlib.Path.mkdir", "test_plugin.pyramid"])
+def test_what_is_no_network_is_not_called(name, tmp_path):
+    arguments = {"path": str(tmp_path / "made")} if name == "os.mkdir" else {"self": tmp_path / "made"}
+    with pytest.raises(InputError, match=r"^depth\._target_: expected .*, got .*\.$"):
+        build({"_target_": name, **arguments}, DepthEstimator)
+    assert not (tmp_path / "made").exists()
 
 
 def test_the_role_of_a_network_is_named_in_what_is_refused():
@@ -141,6 +150,10 @@ def test_the_role_of_a_network_is_named_in_what_is_refused():
         (
             pyramid(fine=torch.rand(2, 5, 1, 2), w_fine=torch.ones(2, 1, 2)),
             "maps[1]: expected at most 1 x 2 (finest first)",
+        ),
+        (
+            pyramid(coarse=torch.rand(2, 7, 2, 3)),
+            "maps[1]: expected a panorama's maps twice as wide as high, got 2 x 3.",
         ),
         (pyramid(w_coarse=torch.ones(2, 4, 8)), "confidence[1]: expected shape [2, 2, 4], got [2, 4, 8]."),
         (
@@ -187,6 +200,18 @@ def test_ranges_that_break_their_word_are_refused_by_the_name_of_their_class(ans
     text = str(refused.value)
     assert text.startswith("depth (test_plugin.Answer): " + sentence)
     assert text.endswith(".")
+
+
+def test_maps_of_another_image_than_a_panorama_may_have_any_sides():
+    answer = FeaturePyramid([torch.rand(1, 5, 4, 3)], [torch.ones(1, 4, 3)])
+    assert len(checked_features(Answer(answer), torch.rand(1, 3, 6, 8)).maps) == 1
+
+
+def test_numbers_that_are_not_finite_are_an_error_of_their_own():
+    with pytest.raises(NonFiniteError):
+        checked_features(Answer(pyramid(fine=spoiled(torch.rand(2, 5, 4, 8), math.nan))), IMAGE)
+    with pytest.raises(NonFiniteError):
+        checked_ranges(Answer(ranges(rho=spoiled(torch.ones(2, 4, 8), math.inf))), IMAGE)
 
 
 @pytest.mark.parametrize("check", [checked_features, checked_ranges])

@@ -2,12 +2,14 @@
 
 import csv
 import io
+import json
 import math
 import os
 import random
 import signal
 import subprocess
 import sys
+import time
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
@@ -20,8 +22,9 @@ from torch import Tensor, nn
 from toy_experiment import SETTINGS, Toy, toy_module
 
 from torchvo360.checks import InputError
-from torchvo360.learn import Ending, TrainerConfig, load_checkpoint, train
-from torchvo360.learn.checkpoint import read_config, read_tensors
+from torchvo360.files import atomic_path
+from torchvo360.learn import Ending, NonFiniteError, TrainerConfig, load_checkpoint, train
+from torchvo360.learn.checkpoint import read_config, read_tensors, tensors_to_bytes
 from torchvo360.learn.resume import load_state
 from torchvo360.learn.schedule import learning_rate
 
@@ -221,6 +224,47 @@ def test_training_ends_after_too_many_steps_without_finite_numbers_and_keeps_the
     assert load_state(tmp_path / "state.safetensors", module, torch.optim.AdamW(module.parameters())).step == 7
 
 
+@pytest.mark.parametrize("at", [2, 7])
+def test_a_step_whose_network_gives_no_finite_numbers_is_skipped_and_resumed_behind(tmp_path, at):
+    class Lost(InterruptedToy):
+        def losses(self, module, batch):
+            self.seen = [*getattr(self, "seen", []), {k: v.clone() for k, v in module.state_dict().items()}]
+            losses = super().losses(module, batch)
+            if module.training and self.now == 7:
+                raise NonFiniteError("features (Net): expected finite values, got 1 of 2 that are not.")
+            return losses
+
+        def batch(self, step, part, parts):
+            self.now = step
+            return super().batch(step, part, parts)
+
+    (whole := tmp_path / "whole").mkdir()
+    (parts := tmp_path / "parts").mkdir()
+    toy = Lost(CONFIG)
+    toy.at = -1
+    outcome = train(toy, CONFIG, whole)
+    assert (outcome.ending, outcome.skipped) == (Ending.FINISHED, 1)
+    assert [row["step"] for row in rows(whole / "train.csv") if not row["loss"]] == ["8"]
+    assert all(torch.equal(value, toy.seen[8][name]) for name, value in toy.seen[7].items())
+    toy = Lost(CONFIG)
+    toy.at = at
+    with pytest.raises(BrokenOffError):
+        train(toy, CONFIG, parts)
+    toy = Lost(CONFIG)
+    toy.at = -1
+    train(toy, CONFIG, parts, resume=True)
+    assert_same_bits(whole, parts)
+
+
+def test_a_network_that_was_never_finite_is_told(tmp_path):
+    class Lost(Toy):
+        def losses(self, module, batch):
+            raise NonFiniteError("features (Net): expected finite values, got 1 of 2 that are not.")
+
+    with pytest.raises(NonFiniteError, match=r"^features \(Net\)"):
+        train(Lost(CONFIG), CONFIG, tmp_path)
+
+
 def test_gradients_are_no_longer_than_the_clip_norm(tmp_path):
     lengths = []
 
@@ -294,6 +338,102 @@ def test_a_state_of_another_network_or_a_damaged_one_is_refused(tmp_path):
         train(Toy(CONFIG), CONFIG, tmp_path, resume=True)
 
 
+@pytest.mark.parametrize(
+    "changes",
+    [
+        *({"step": value} for value in (None, -3, 1.5, True, "7", 2**70)),
+        *({"best": value} for value in (math.nan, math.inf, "0.1", [])),
+        {"best_step": 31}, {"skipped": -1}, {"skipped_in_a_row": 31}, {"without_better": 40},
+        {"seconds": -1.0}, {"seconds": None}, {"watch": None}, {"losses": "loss"}, {"losses": [1]}, {"more": 1},
+    ],
+)  # fmt: skip
+def test_a_state_that_cannot_be_is_refused_and_changes_nothing(uninterrupted, tmp_path, changes):
+    tensors, metadata = read_tensors(uninterrupted / "state.safetensors")
+    progress = json.loads(metadata["progress"]) | changes
+    state = tmp_path / "state.safetensors"
+    state.write_bytes(tensors_to_bytes(tensors, metadata | {"progress": json.dumps(progress)}))
+    assert_refused_unchanged(state)
+
+
+def assert_refused_unchanged(state: Path) -> None:
+    toy = Toy(CONFIG)
+    before = {name: value.clone() for name, value in toy.module.state_dict().items()}
+    with pytest.raises(InputError, match=r"^resume: expected .*, got .*\.$"):
+        train(toy, CONFIG, state.parent, resume=True)
+    assert all(torch.equal(value, before[name]) for name, value in toy.module.state_dict().items())
+    assert [path.name for path in state.parent.iterdir()] == ["state.safetensors"]
+
+
+@pytest.mark.parametrize("key", ["step", "best", "watch"])
+def test_a_state_without_a_field_is_refused(uninterrupted, tmp_path, key):
+    tensors, metadata = read_tensors(uninterrupted / "state.safetensors")
+    progress = {name: value for name, value in json.loads(metadata["progress"]).items() if name != key}
+    state = tmp_path / "state.safetensors"
+    state.write_bytes(tensors_to_bytes(tensors, metadata | {"progress": json.dumps(progress)}))
+    assert_refused_unchanged(state)
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda t: t.pop("optimizer.0.exp_avg"),
+        lambda t: [t.pop(f"optimizer.0.{name}") for name in ("step", "exp_avg", "exp_avg_sq")],
+        lambda t: t.update({"optimizer.0.exp_avg": torch.zeros(())}),
+        lambda t: t.update({"optimizer.0.step": torch.tensor(math.nan)}),
+        lambda t: t.update({"optimizer.0.exp_avg_sq": -1 - t["optimizer.0.exp_avg_sq"]}),
+        lambda t: t.update({"optimizer.99.step": t.pop("optimizer.0.step")}),
+        lambda t: t.update({"optimizer.0.more": t.pop("optimizer.0.step")}),
+    ],
+)
+def test_a_state_of_another_optimizer_is_refused(uninterrupted, tmp_path, change):
+    tensors, metadata = read_tensors(uninterrupted / "state.safetensors")
+    change(tensors)
+    state = tmp_path / "state.safetensors"
+    state.write_bytes(tensors_to_bytes(tensors, metadata))
+    assert_refused_unchanged(state)
+
+
+def test_checkpoints_without_a_state_are_not_resumed_and_stay(tmp_path):
+    train(Toy(CONFIG), CONFIG, tmp_path)
+    (tmp_path / "state.safetensors").unlink()
+    before = {path.name: path.read_bytes() for path in tmp_path.iterdir() if path.is_file()}
+    with pytest.raises(
+        InputError, match=r"^resume: expected state.safetensors beside the checkpoints in .*, got none.$"
+    ):
+        train(Toy(CONFIG), CONFIG, tmp_path, resume=True)
+    assert {path.name: path.read_bytes() for path in tmp_path.iterdir() if path.is_file()} == before
+
+
+def test_a_training_is_not_resumed_with_another_figure_to_watch(tmp_path):
+    train(Toy(CONFIG), CONFIG, tmp_path)
+    with pytest.raises(InputError, match=r"^watch: expected loss, by which .* its best, got -loss\.$"):
+        train(Toy(CONFIG), replace(CONFIG, watch="-loss"), tmp_path, resume=True)
+
+
+@pytest.mark.parametrize("name", ["state.safetensors", "train.csv"])
+def test_what_a_kill_leaves_is_cleared_away(tmp_path, name):
+    with atomic_path(tmp_path / name) as temporary:
+        temporary.write_bytes(b"whole")
+    temporary.write_bytes(b"half")  # of a second writing, which was killed
+    (tmp_path / ".notes.part").write_text("of somebody else")
+    train(Toy(CONFIG), replace(CONFIG, steps=1), tmp_path)
+    assert not temporary.exists()
+    assert (tmp_path / ".notes.part").exists()
+
+
+def test_a_wrong_name_to_watch_leaves_an_earlier_training_as_it_was(uninterrupted, tmp_path):
+    train(Toy(CONFIG), CONFIG, tmp_path)
+    with pytest.raises(InputError, match=r"^watch: "):
+        train(Toy(CONFIG), replace(CONFIG, watch="rmse"), tmp_path)
+    assert_same_bits(uninterrupted, tmp_path)
+
+
+def test_a_place_of_tensorboards_folder_that_is_taken_is_told(tmp_path):
+    (tmp_path / "tensorboard").write_text("a file")
+    with pytest.raises(InputError, match=r"^tensorboard: expected a folder to write to, got .*tensorboard: .*\.$"):
+        train(Toy(CONFIG), CONFIG, tmp_path)
+
+
 def test_a_folder_that_cannot_be_written_is_told(tmp_path):
     with pytest.raises(InputError, match=r"^train.csv: expected a folder to write to, got .*\.$"):
         train(Toy(CONFIG), CONFIG, tmp_path / "absent")
@@ -318,9 +458,13 @@ def test_the_progress_bar_shows_the_losses_where_there_is_a_terminal(tmp_path, m
         def isatty(self):
             return True
 
+    def slowly() -> bool:
+        time.sleep(0.01)  # the bar is drawn every 0.1 s at most
+        return False
+
     for progress, shown in ((True, True), (False, False)):
         monkeypatch.setattr(sys, "stderr", terminal := Terminal())
-        train(Toy(CONFIG), replace(CONFIG, progress=progress), tmp_path)
+        train(Toy(CONFIG), replace(CONFIG, progress=progress), tmp_path, stopped=slowly)
         assert ("rmse=" in terminal.getvalue()) is shown
 
 
@@ -332,8 +476,10 @@ def test_importing_the_package_takes_no_extra():
     assert done.stdout.decode().strip() == "[]"
 
 
-@pytest.mark.parametrize("module", ["lightning_fabric", "torch.utils.tensorboard", "safetensors"])
-def test_the_extra_that_is_missing_is_named(tmp_path, monkeypatch, module):
+@pytest.mark.parametrize(
+    ("module", "extra"), [("lightning_fabric", "train"), ("torch.utils.tensorboard", "train"), ("safetensors", "learn")]
+)
+def test_the_extra_that_is_missing_is_named(tmp_path, monkeypatch, module, extra):
     monkeypatch.setitem(sys.modules, module, None)
-    with pytest.raises(InputError, match=r"^\w+: expected .*pip install 'torchvo360\[train\]' brings\.$"):
+    with pytest.raises(InputError, match=rf"^\w+: expected .*pip install 'torchvo360\[{extra}\]' brings\.$"):
         train(Toy(CONFIG), CONFIG, tmp_path)

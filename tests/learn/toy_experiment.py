@@ -8,12 +8,12 @@ from pathlib import Path
 import torch
 from torch import Tensor, nn
 
-from torchvo360.learn import TrainerConfig, train
+from torchvo360.learn import NonFiniteError, TrainerConfig, train
 
 SETTINGS = {"steps": 30, "batch_size": 4, "warmup_steps": 5, "validate_every": 10, "save_every": 7, "progress": False}
 
 
-def toy_module(dtype: torch.dtype = torch.float32, *, plain: bool = False) -> nn.Module:
+def toy_module(dtype: torch.dtype = torch.float32, *, plain: bool = False) -> nn.Sequential:
     """Without normalisation and dropout (plain), the joint batch of several processes is a mean over their shares."""
     with torch.random.fork_rng():
         torch.manual_seed(5)
@@ -22,12 +22,17 @@ def toy_module(dtype: torch.dtype = torch.float32, *, plain: bool = False) -> nn
         return nn.Sequential(*layers).to(dtype)
 
 
+class ToyNet(nn.Sequential):
+    def __init__(self, *, plain: bool = False) -> None:
+        super().__init__(*toy_module(plain=plain))
+
+
 class Toy:
     def __init__(self, config: TrainerConfig, *, plain: bool = False, dtype: torch.dtype = torch.float32) -> None:
         self.config = config
         self.spec = {"_target_": "toy_experiment.toy_module"}
         self.dtype = dtype
-        self.module = toy_module(dtype, plain=plain)
+        self.module: nn.Module = toy_module(dtype, plain=plain)
 
     def batch(self, step: int, part: int, parts: int) -> dict[str, Tensor]:
         generator = torch.Generator().manual_seed(step)
@@ -55,9 +60,24 @@ class KilledToy(Toy):
         return super().batch(step, part, parts)
 
 
+class LostToy(Toy):
+    """Gives the last process features that are not finite, once."""
+
+    def batch(self, step: int, part: int, parts: int) -> dict[str, Tensor]:
+        batch = super().batch(step, part, parts)
+        return batch | {"lost": torch.tensor(step == 12 and part == parts - 1)}
+
+    def losses(self, module: nn.Module, batch: dict[str, Tensor]) -> dict[str, Tensor]:
+        losses = super().losses(module, batch)
+        if batch["lost"]:
+            raise NonFiniteError("features (Toy): expected finite values, got others.")
+        return losses
+
+
 if __name__ == "__main__":
     torch.set_num_threads(1)
     what, folder = sys.argv[1], Path(sys.argv[2])
     config = TrainerConfig(**SETTINGS)
-    toy = KilledToy(config) if what == "killed" else Toy(config, plain=True, dtype=torch.float64)
+    kind = {"killed": KilledToy, "lost": LostToy, "plain": Toy}[what]
+    toy = KilledToy(config) if what == "killed" else kind(config, plain=True, dtype=torch.float64)
     train(toy, config, folder)

@@ -15,10 +15,13 @@ from torch import Tensor, nn
 
 from torchvo360.checks import InputError
 from torchvo360.files import write_atomically
-from torchvo360.learn.plugin import TARGET, construct, import_name
+from torchvo360.learn.plugin import TARGET, construct, import_name, import_network
 
 NOTES = ("made_by", "figures")
 """Keys of the json that tell how the network came about: the command, and what it reached; not arguments."""
+
+FLOATS = (torch.float16, torch.bfloat16, torch.float32, torch.float64)
+"""Kinds of numbers that may stand for each other; smaller ones are not computed with."""
 
 HOME = "torchvo360.learn."
 
@@ -54,8 +57,9 @@ def load_checkpoint(path: str | Path, target: str | Callable[..., nn.Module] | N
 
     Args:
         path: Of the .safetensors, with or without its suffix; the .json lies beside it.
-        target: The class to make, or its dotted name, where it is not one of `torchvo360.learn`: a checkpoint is not
-            trusted to name others, as that would run their code. It is called with the arguments of the json.
+        target: The class to make (or a function that makes the network), or the dotted name of the class, where it is
+            not one of `torchvo360.learn`: a checkpoint is not trusted to name others, as that would run their code.
+            It is called with the arguments of the json.
 
     Raises:
         InputError: A file is missing or damaged, the class is not allowed or refuses its arguments, or the tensors do
@@ -64,11 +68,11 @@ def load_checkpoint(path: str | Path, target: str | Callable[..., nn.Module] | N
     weights, _ = _paths(path)
     config = read_config(path)
     arguments = {key: value for key, value in config.items() if key not in (TARGET, *NOTES)}
-    name = config[TARGET] if target is None else target if isinstance(target, str) else target.__qualname__
+    name = config[TARGET] if target is None else target if isinstance(target, str) else _called(target)
     if target is None:
         target = _own_class(name, weights)
     elif isinstance(target, str):
-        target = import_name("target", target)
+        target = import_network("target", target)
     module = construct(target, name, arguments, "checkpoint")
     load_tensors(module, read_tensors(weights)[0], str(weights))
     return module.eval()
@@ -121,8 +125,17 @@ def load_tensors(module: nn.Module, tensors: Mapping[str, Tensor], source: str) 
     """Copy tensors into a module, every one and no other.
 
     Raises:
-        InputError: Names, shapes or kinds of numbers differ from the module's, or a number is not finite; then the
-            module is as it was.
+        InputError: They do not fit, as `check_tensors` says; then the module is as it was.
+    """
+    check_tensors(module, tensors, source)
+    module.load_state_dict(dict(tensors))
+
+
+def check_tensors(module: nn.Module, tensors: Mapping[str, Tensor], source: str) -> None:
+    """Hold tensors to be those of a module.
+
+    Raises:
+        InputError: Names, shapes or kinds of numbers differ from the module's, or a number is not finite.
     """
     own = module.state_dict()
     missing, foreign = sorted(own.keys() - tensors.keys()), sorted(tensors.keys() - own.keys())
@@ -132,12 +145,14 @@ def load_tensors(module: nn.Module, tensors: Mapping[str, Tensor], source: str) 
         raise InputError(f"checkpoint: expected the tensors of {kind}, got {source} {' and '.join(parts)}.")
     for name, value in tensors.items():
         want = own[name]
-        if value.shape != want.shape or value.is_floating_point() != want.is_floating_point():
+        alike = value.dtype in FLOATS and want.dtype in FLOATS
+        if value.shape != want.shape or not (alike or value.dtype == want.dtype):
             expected, got = (f"{list(tensor.shape)} of {tensor.dtype}" for tensor in (want, value))
             raise InputError(f"checkpoint: expected {name} to be {expected}, got {got} in {source}.")
+        if value.is_floating_point() and not alike:
+            raise InputError(f"checkpoint: expected 16 bits or more a number, got {name} of {value.dtype} in {source}.")
         if not bool(torch.isfinite(value).all()):
             raise InputError(f"checkpoint: expected finite numbers, got others in {name} of {source}.")
-    module.load_state_dict(dict(tensors))
 
 
 def _own_class(name: str, source: Path) -> type[nn.Module]:
@@ -149,8 +164,14 @@ def _own_class(name: str, source: Path) -> type[nn.Module]:
     return found
 
 
+def _called(target: object) -> str:
+    return getattr(target, "__qualname__", type(target).__name__)
+
+
 def _paths(path: str | Path) -> tuple[Path, Path]:
     path = Path(path)
+    if not path.name:  # such as "." and "/"
+        raise InputError(f"checkpoint: expected the path of a file, got {str(path)!r}.")
     stem = path.with_suffix("") if path.suffix in (".safetensors", ".json") else path
     return stem.with_name(f"{stem.name}.safetensors"), stem.with_name(f"{stem.name}.json")
 

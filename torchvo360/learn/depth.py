@@ -6,6 +6,7 @@ and are wrong by far at the edges of things. To first order the variance of rho 
 
 import itertools
 import math
+import reprlib
 from collections.abc import Sequence
 
 import torch
@@ -27,12 +28,16 @@ LOG_SCALE = (-5.0, 1.0)
 """Scales of the Laplace distribution of log rho that the network can give, as logarithms."""
 
 
+MAX_WIDTH, MAX_LEVELS, MAX_CHANNELS = 8192, 8, 1024
+"""Bounds of what a checkpoint, which may be a stranger's, can have made."""
+
+
 class PanoramaDepth(nn.Module):
     """A U-Net on the sphere from one panorama to inverse ranges; it turns with the panorama by whole blocks of pixels.
 
     Args:
-        width: Width at which the network sees a panorama, pixels: a multiple of `2^levels`.
-        channels: Channels of each level, the finest first, multiples of 8.
+        width: Width at which the network sees a panorama, pixels: a multiple of `2^(levels + 1)`, at most 8192.
+        channels: Channels of each of at most 8 levels, the finest first, multiples of 8 up to 1024.
 
     Raises:
         InputError: The width does not halve that often, or a level has another number of channels.
@@ -41,11 +46,13 @@ class PanoramaDepth(nn.Module):
     def __init__(self, width: int = 256, channels: Sequence[int] = (16, 32, 48, 64, 64)) -> None:
         super().__init__()
         self.width, self.channels = width, list(channels)
+        if not 1 <= len(channels) <= MAX_LEVELS or any(c not in range(8, MAX_CHANNELS + 1, 8) for c in channels):
+            expected = f"1 to {MAX_LEVELS} multiples of 8 up to {MAX_CHANNELS}"
+            raise InputError(f"channels: expected {expected}, got {reprlib.repr(self.channels)}.")
         blocks_px = FOLD * 2 ** len(channels)
-        if width < blocks_px or width % blocks_px:
-            raise InputError(f"width: expected a multiple of {blocks_px} for {len(channels)} levels, got {width}.")
-        if not channels or min(channels) < 8 or any(count % 8 for count in channels):
-            raise InputError(f"channels: expected multiples of 8, got {self.channels}.")
+        if width not in range(blocks_px, MAX_WIDTH + 1, blocks_px):
+            expected = f"a multiple of {blocks_px} up to {MAX_WIDTH} for {len(channels)} levels"
+            raise InputError(f"width: expected {expected}, got {reprlib.repr(width)}.")
         steps = list(itertools.pairwise(channels))
         self.entry = SphericalConv2d(3 * FOLD**2 + 2, channels[0])
         self.encoders = nn.ModuleList(_Block(count) for count in channels)

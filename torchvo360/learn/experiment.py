@@ -1,11 +1,15 @@
 """What is learned: the contract between an experiment and its trainer."""
 
+import math
+from collections.abc import Sequence
 from typing import Any, Protocol
 
+import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
 from torchvo360.checks import InputError
+from torchvo360.learn.plugin import NonFiniteError
 
 
 class Experiment(Protocol):
@@ -28,7 +32,10 @@ class Experiment(Protocol):
         ...
 
     def losses(self, module: nn.Module, batch: Any) -> dict[str, Tensor]:
-        """Return named scalars of a batch: `loss`, a mean over its elements, is minimised; the others are shown."""
+        """Return named scalars of a batch: `loss`, a mean over its elements, is minimised; the others are shown.
+
+        Where it raises `NonFiniteError`, as `checked_features` and `checked_ranges` do, the step is skipped.
+        """
         ...
 
     def validate(self, module: nn.Module) -> dict[str, float]:
@@ -48,15 +55,33 @@ class Objective(nn.Module):
         self.module = experiment.module
         self._losses = experiment.losses
 
-    def forward(self, batch: Any) -> dict[str, Tensor]:
-        """Return the losses of one process's share of a batch.
+    def forward(self, batch: Any, names: Sequence[str]) -> dict[str, Tensor]:
+        """Return the losses of one process's share of a batch, all NaN where the network gave no finite numbers.
+
+        Args:
+            batch: The share.
+            names: Those of the losses of the steps before, none before the first.
 
         Raises:
-            InputError: They are not named scalars with a `loss` to minimise among them.
+            InputError: They are not named scalars with a `loss` to minimise among them, or the first are not finite.
         """
-        losses = self._losses(self.module, batch)
+        try:
+            losses = self._losses(self.module, batch)
+        except NonFiniteError:
+            if not names:  # the network was never fine
+                raise
+            return self._not_finite(names)
         _check(losses)
         return losses
+
+    def _not_finite(self, names: Sequence[str]) -> dict[str, Tensor]:
+        """Return losses of NaN that depend on every parameter.
+
+        So all gradients are NaN, and their mean over processes too: none is left waiting, and all skip the step.
+        """
+        learned = [parameter.sum() for parameter in self.module.parameters() if parameter.requires_grad]
+        nothing = torch.stack(learned).sum() * math.nan
+        return {name: nothing if name == "loss" else nothing.detach() for name in names}
 
 
 def _check(losses: dict[str, Tensor]) -> None:

@@ -6,6 +6,7 @@ Spreading commutes with every rotation of the camera, so that only what is sprea
 """
 
 import math
+import reprlib
 from collections.abc import Collection, Sequence
 from itertools import pairwise
 from typing import Any
@@ -29,6 +30,10 @@ DARK = 0.03
 """Intensity below which the logarithm of the input flattens: about the noise of a dark image."""
 
 
+MAX_LEVELS, MAX_CHANNELS = 8, 1024
+"""Bounds of what a checkpoint, which may be a stranger's, can have made."""
+
+
 class PanoramaFeatures(nn.Module):
     """A feature extractor for panoramas of 128 x 64 pixels and more.
 
@@ -37,12 +42,13 @@ class PanoramaFeatures(nn.Module):
     scale. The network turns with the panorama about its vertical axis, by whole pixels of its smallest map.
 
     Args:
-        widths: Channels inside the network at each size, the finest first.
-        channels: Channels of each map, one number for each of `widths`.
-        spread_deg: Angles by which the coarse maps are spread, the finest first, degrees.
+        widths: Channels inside the network at each of at most 8 sizes, the finest first: at most 1024.
+        channels: Channels of each map, one number for each of `widths`: at most 1024.
+        spread_deg: At most 8 angles by which the coarse maps are spread, the finest first, degrees.
 
     Raises:
-        InputError: Numbers of channels do not fit each other or are no multiples of 4, or an angle is not in (5, 90].
+        InputError: Numbers of channels do not fit each other, are too large or no multiples of 4, or an angle is not in
+            (5, 90].
     """
 
     def __init__(
@@ -52,11 +58,15 @@ class PanoramaFeatures(nn.Module):
         spread_deg: Sequence[float] = (15.0, 30.0, 60.0),
     ) -> None:
         super().__init__()
-        if len(channels) != len(widths) or not widths or any(width < 4 or width % 4 for width in widths):
-            given = f"{list(widths)} and {list(channels)}"
-            raise InputError(f"widths, channels: expected as many of each, widths multiples of 4, got {given}.")
-        if min(channels) < 1:
-            raise InputError(f"channels: expected at least 1 each, got {list(channels)}.")
+        fit = len(channels) == len(widths) and 1 <= len(widths) <= MAX_LEVELS
+        if not fit or any(width not in range(4, MAX_CHANNELS + 1, 4) for width in widths):
+            expected = f"as many of each, 1 to {MAX_LEVELS}, widths multiples of 4 up to {MAX_CHANNELS}"
+            given = f"{reprlib.repr(list(widths))} and {reprlib.repr(list(channels))}"
+            raise InputError(f"widths, channels: expected {expected}, got {given}.")
+        if any(count not in range(1, MAX_CHANNELS + 1) for count in channels):
+            raise InputError(f"channels: expected 1 to {MAX_CHANNELS} each, got {reprlib.repr(list(channels))}.")
+        if len(spread_deg) > MAX_LEVELS:
+            raise InputError(f"spread_deg: expected at most {MAX_LEVELS} angles, got {len(spread_deg)}.")
         for angle in spread_deg:
             check_finite_number("spread_deg", angle, above=5.0, at_most=90.0)
         inputs = (3, *widths[:-1])
@@ -134,7 +144,8 @@ def pair_features(
     network: nn.Module, ref: Float[Tensor, "B 3 H W"], tgt: Float[Tensor, "B 3 H W"]
 ) -> tuple[FeaturePyramid, FeaturePyramid]:
     """Return the features of both images of pairs, in one pass; the network is held to `FeatureExtractor`."""
-    maps, confidence = checked_features(network, torch.cat([ref, tgt]))
+    # Autocast may have halved them, and alignment needs all their digits.
+    maps, confidence = ([each.float() for each in part] for part in checked_features(network, torch.cat([ref, tgt])))
     first, second = (
         FeaturePyramid([each[part] for each in maps], [each[part] for each in confidence])
         for part in (slice(None, len(ref)), slice(len(ref), None))

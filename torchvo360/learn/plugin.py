@@ -15,6 +15,10 @@ TARGET = "_target_"
 """The key of a specification that names the class; the others are its arguments."""
 
 
+class NonFiniteError(InputError):
+    """A network gave numbers that are not finite; a training skips such a step."""
+
+
 class FeaturePyramid(NamedTuple):
     """Feature maps and how far to trust each of their pixels, the finest level first."""
 
@@ -27,7 +31,10 @@ class FeatureExtractor(Protocol):
     """What the class named by `features._target_` must fulfil, besides being an `nn.Module`."""
 
     def __call__(self, image: Float[Tensor, "B 3 H W"]) -> FeaturePyramid:
-        """Return the pyramid of a batch of images in [0, 1]; no level is larger than the one before it."""
+        """Return the pyramid of a batch of images in [0, 1]; no level is larger than the one before it.
+
+        Those of a full panorama are full panoramas, twice as wide as high.
+        """
         ...
 
 
@@ -59,18 +66,30 @@ def build(spec: Mapping[str, Any], protocol: type) -> nn.Module:
     from the user; that of a checkpoint, which is a file, goes through `load_checkpoint`.
 
     Args:
-        spec: The dotted name of an importable class (or of a function that returns a module), and its arguments.
+        spec: The dotted name of an importable subclass of `nn.Module`, and its arguments.
         protocol: `FeatureExtractor` or `DepthEstimator`.
 
     Raises:
-        InputError: The name cannot be imported, or what it names refuses the arguments or makes no `nn.Module`.
+        InputError: The name cannot be imported, is not that of such a class, or the class refuses the arguments.
     """
     role = ROLES[protocol]
     if not isinstance(spec, Mapping) or TARGET not in spec:
         raise InputError(f"{role}: expected the key {TARGET}, such as {role}.{TARGET}=my.module.Net, got {spec!r}.")
     name = spec[TARGET]
     arguments = {key: value for key, value in spec.items() if key != TARGET}
-    return construct(import_name(f"{role}.{TARGET}", name), name, arguments, role)
+    return construct(import_network(f"{role}.{TARGET}", name), name, arguments, role)
+
+
+def import_network(key: str, name: object) -> type[nn.Module]:
+    """Import a network's class as `import_name` does; what is none is refused before anything calls it.
+
+    Raises:
+        InputError: It is no dotted name, cannot be imported, or names something else.
+    """
+    found = import_name(key, name)
+    if not (isinstance(found, type) and issubclass(found, nn.Module)):
+        raise InputError(f"{key}: expected a subclass of torch.nn.Module, got {name}, a {type(found).__name__}.")
+    return found
 
 
 def import_name(key: str, name: object) -> Any:
@@ -94,7 +113,7 @@ def import_name(key: str, name: object) -> Any:
 
 
 def construct(target: Any, name: str, arguments: Mapping[str, Any], role: str) -> nn.Module:
-    """Call a class with arguments and hold the result to be a module.
+    """Call a class, or a function, with arguments and hold the result to be a module.
 
     Raises:
         InputError: It cannot be called so, or makes something else.
@@ -118,6 +137,7 @@ def checked_features(net: nn.Module, image: Float[Tensor, "B 3 H W"]) -> Feature
 
     Raises:
         ShapeError: The image is not [B, 3, H, W].
+        NonFiniteError: A value is not finite.
         InputError: The network returned something else: one sentence names its class and what is wrong.
     """
     sizes = check_shape("image", image, "B 3 H W")
@@ -138,6 +158,9 @@ def checked_features(net: nn.Module, image: Float[Tensor, "B 3 H W"]) -> Feature
             got = f"{features.shape[2]} x {features.shape[3]}"
             raise InputError(f"{who}: maps[{level}]: expected at most {height} x {width} (finest first), got {got}.")
         height, width = features.shape[2:]
+        if sizes["W"] == 2 * sizes["H"] and width != 2 * height:  # aligned with the camera `resized` to the map
+            expected = "a panorama's maps twice as wide as high"
+            raise InputError(f"{who}: maps[{level}]: expected {expected}, got {height} x {width}.")
         _check(f"{who}: confidence[{level}]", weight, image, (sizes["B"], height, width))
         if not bool((weight >= 0).all()):
             raise InputError(f"{who}: confidence[{level}]: expected values of at least 0, got {weight.min():.4g}.")
@@ -149,6 +172,7 @@ def checked_ranges(net: nn.Module, image: Float[Tensor, "B 3 H W"]) -> RangeEsti
 
     Raises:
         ShapeError: The image is not [B, 3, H, W].
+        NonFiniteError: A value is not finite.
         InputError: The network returned something else: one sentence names its class and what is wrong.
     """
     sizes = check_shape("image", image, "B 3 H W")
@@ -174,7 +198,7 @@ def _check(name: str, value: object, image: Tensor, shape: tuple[int | None, ...
     if value.device != image.device:
         raise InputError(f"{name}: expected the image's device {image.device}, got {value.device}.")
     if bad := int((~torch.isfinite(value)).sum()):
-        raise InputError(f"{name}: expected finite values, got {bad} of {value.numel()} that are not.")
+        raise NonFiniteError(f"{name}: expected finite values, got {bad} of {value.numel()} that are not.")
 
 
 def _name(net: nn.Module) -> str:

@@ -5,6 +5,7 @@ import importlib
 import io
 import math
 from collections.abc import Mapping
+from contextlib import ExitStack, closing
 from pathlib import Path
 from types import TracebackType
 from typing import Any
@@ -34,10 +35,19 @@ class Record:
     """
 
     def __init__(self, folder: Path, step: int, steps: int, *, progress: bool) -> None:
-        self._tables = {name: _Table(folder / name, step) for name in (TRAIN, VALIDATION)}
-        self._board = _tensorboard().SummaryWriter(str(folder / TENSORBOARD), purge_step=step + 1 if step else None)
-        disable = None if progress else True  # None: where standard error is no terminal
-        self._bar = tqdm(total=steps, initial=step, unit="step", disable=disable, leave=False, dynamic_ncols=True)
+        tensorboard = _tensorboard()
+        with ExitStack() as opened:
+            tables = {name: opened.enter_context(closing(_Table(folder / name, step))) for name in (TRAIN, VALIDATION)}
+            try:
+                board = tensorboard.SummaryWriter(str(folder / TENSORBOARD), purge_step=step + 1 if step else None)
+            except OSError as error:
+                expected = f"{TENSORBOARD}: expected a folder to write to"
+                raise InputError(f"{expected}, got {folder / TENSORBOARD}: {error.strerror}.") from None
+            self._tables, self._board = tables, opened.enter_context(closing(board))
+            disable = None if progress else True  # None: where standard error is no terminal
+            bar = tqdm(total=steps, initial=step, unit="step", disable=disable, leave=False, dynamic_ncols=True)
+            self._bar = opened.enter_context(bar)
+            self._opened = opened.pop_all()
 
     def __enter__(self) -> "Record":
         return self
@@ -45,10 +55,7 @@ class Record:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        self._bar.close()
-        self._board.close()
-        for table in self._tables.values():
-            table.close()
+        self._opened.close()
 
     def train(self, step: int, losses: Mapping[str, float], others: Mapping[str, float]) -> None:
         """Note a step's losses, which the bar shows, and other figures of it."""

@@ -29,6 +29,9 @@ BEST, LAST = "best", "last"
 CHECKPOINTS = (STATE, *(f"{name}.{suffix}" for name in (BEST, LAST) for suffix in ("safetensors", "json")))
 """By these files a folder holds a training."""
 
+LEFTOVERS = f".*.{'[0-9a-f]' * 8}.part*"
+"""The temporary files of `torchvo360.files.atomic_path`, which a kill leaves behind."""
+
 
 class Ending(StrEnum):
     """Why a training ended."""
@@ -81,13 +84,13 @@ def train(
         experiment: What is learned.
         config: Settings.
         folder: Where the files go; it exists. Those of an earlier training are replaced.
-        resume: Continue from the folder's state; without one, begin.
+        resume: Continue from the folder's state; where there is no training, begin.
         made_by: The command, for the checkpoints.
         stopped: Asked after every step; where it answers yes in any process, the training is saved and ends.
 
     Raises:
         InputError: The extra `train` is not installed, there is no such device, the folder cannot be written, its
-            state does not fit, or the experiment gives no `loss` or not the figure to watch.
+            state is missing or does not fit, or the experiment gives no `loss` or not the figure to watch.
     """
     with own_random_numbers():
         training = _Training(experiment, config, folder, join(config), made_by, stopped)
@@ -119,28 +122,34 @@ class _Training:
             raise InputError(f"module: expected parameters to learn, got none in {type(self.module).__name__}.")
         self.optimizer = torch.optim.AdamW(self.parameters, config.learning_rate, weight_decay=config.weight_decay)
         self.objective, self.wrapped_optimizer = fabric.setup(Objective(experiment), self.optimizer)
-        self.progress = Progress()
+        self.progress = Progress(watch=config.watch)
         self.figures: dict[str, float] = {}
         self.began = time.perf_counter()
 
     def begin(self, resume: bool) -> None:
-        """Take up the folder's state, or clear away what an earlier training left."""
-        state = self.folder / STATE
-        if self.fabric.is_global_zero:
-            for leftover in self.folder.glob(".*.part"):  # a kill's
-                leftover.unlink(missing_ok=True)
-        if resume and state.is_file():
+        """Take up the folder's state, where one is asked for and there is a training."""
+        if resume and any((self.folder / name).exists() for name in CHECKPOINTS):
+            state = self.folder / STATE
+            if not state.is_file():
+                raise InputError(f"resume: expected {STATE} beside the checkpoints in {self.folder}, got none.")
             self.progress = load_state(state, self.module, self.optimizer)
+            if self.progress.watch != self.config.watch:
+                expected = f"watch: expected {self.progress.watch}, by which the training to resume picked its best"
+                raise InputError(f"{expected}, got {self.config.watch}.")
             self.began -= self.progress.seconds
-        elif self.fabric.is_global_zero:
-            clear(self.folder)
+        self.fabric.barrier()  # before the first process changes the files by which all decide
 
     def run(self) -> TrainOutcome:
         """Take steps, validate and save until there is a reason to end."""
         config, progress = self.config, self.progress
         saved_step, stop, late = progress.step, False, False
+        if self.fabric.is_global_zero:
+            if progress.step == 0:
+                self._measure()  # a wrong name to watch is told before an earlier training is cleared away
+            self._tidy()
         with self._record() as record:
             if progress.step == 0:
+                self._save(record)  # whenever it is killed, there is a state to resume from
                 self._validate(record)
             while (ending := self._ending(stop, late)) is None:
                 stop, late = self._step(record)
@@ -160,6 +169,13 @@ class _Training:
             seconds=progress.seconds,
             checkpoint=self.folder / f"{BEST}.safetensors",
         )
+
+    def _tidy(self) -> None:
+        """Clear away what a kill left and, at the beginning, what an earlier training left."""
+        for leftover in self.folder.glob(LEFTOVERS):
+            leftover.unlink(missing_ok=True)
+        if self.progress.step == 0:
+            clear(self.folder)
 
     def _record(self) -> AbstractContextManager[Record | None]:
         if not self.fabric.is_global_zero:
@@ -185,13 +201,14 @@ class _Training:
         self.module.train()
         batch = fabric.to_device(self.experiment.batch(progress.step, fabric.global_rank, fabric.world_size))
         buffers = [(buffer, buffer.clone()) for buffer in self.module.buffers()]
-        losses = self.objective(batch)
+        losses = self.objective(batch, progress.losses)
         self.optimizer.zero_grad()
         fabric.backward(losses["loss"])
         length = nn.utils.clip_grad_norm_(self.parameters, self.config.clip_norm or math.inf).item()
         # A process that stepped while another did not would be left waiting: all decide by the same numbers.
         numbers = reduced(fabric, [float(self.stopped()), float(self._is_late()), *losses.values()], "mean")
         values = dict(zip(losses, numbers[2:], strict=True))
+        progress.losses = [*losses]
         self._update(rate, math.isfinite(values["loss"]) and math.isfinite(length), buffers)
         if record is not None:
             others = {"gradient_norm": length, "learning_rate": rate, "seconds": time.perf_counter() - began}
@@ -218,21 +235,30 @@ class _Training:
         progress.step += 1
         self.figures = {}
 
+    def _measure(self) -> None:
+        """Take the figures of the network as it is."""
+        seed_random_numbers(self.config.seed)
+        self.module.eval()
+        with torch.no_grad():
+            self.figures = {key: float(figure) for key, figure in self.experiment.validate(self.module).items()}
+        if self._watched not in self.figures:
+            raise InputError(f"watch: expected one of {', '.join(self.figures)}, got {self._watched}.")
+
+    @property
+    def _watched(self) -> str:
+        return self.config.watch.removeprefix("-")
+
     def _validate(self, record: Record | None) -> None:
-        """Take the figures of the network as it is, and keep it if it is the best."""
+        """Write down the figures of the network as it is, and keep it if it is the best."""
         fabric, progress = self.fabric, self.progress
-        name = self.config.watch.removeprefix("-")
         sign = -1.0 if self.config.watch.startswith("-") else 1.0
         value = 0.0
         if record is not None:
-            seed_random_numbers(self.config.seed)
-            self.module.eval()
+            if not self.figures:
+                self._measure()
             with torch.no_grad():
-                self.figures = {key: float(figure) for key, figure in self.experiment.validate(self.module).items()}
-                if name not in self.figures:
-                    raise InputError(f"watch: expected one of {', '.join(self.figures)}, got {name}.")
                 record.validation(progress.step, self.figures, self.experiment.pictures(self.module))
-            value = self.figures[name]
+            value = self.figures[self._watched]
         (value,) = reduced(fabric, [value], "sum")
         better = math.isfinite(value) and (progress.best is None or sign * value < sign * progress.best)
         if record is not None and (better or progress.step == 0):

@@ -142,6 +142,16 @@ def test_a_few_steps_lower_the_loss(experiment):
         assert 0 <= float(picture.min()) <= float(picture.max()) <= 1, name
 
 
+def test_half_precision_is_for_the_network_alone(tmp_path):
+    overrides = [
+        f"out={tmp_path / 'run'}",
+        *("trainer.steps=1", "trainer.batch_size=2", "pairs.pairs=2", "pairs.kinds=[room]", "validation_pairs=1"),
+        *(f"+features.{key}={value}".replace(" ", "") for key, value in SMALL.items() if key != "_target_"),
+        *("measure=false", "trainer.precision=bf16-mixed"),
+    ]
+    assert main("features", FeaturesConfig, run, overrides) == 0
+
+
 def test_the_script_trains_and_measures(tmp_path, capsys):
     overrides = [
         f"out={tmp_path / 'run'}",

@@ -47,6 +47,13 @@ class Experiment(Protocol):
         ...
 
 
+class Share:
+    """One process's share of a batch, out of sight: Fabric would bring the floats in a network's arguments to half."""
+
+    def __init__(self, batch: Any) -> None:
+        self.batch = batch
+
+
 class Objective(nn.Module):
     """The experiment's losses as one forward pass, which is what averages gradients over processes."""
 
@@ -55,18 +62,18 @@ class Objective(nn.Module):
         self.module = experiment.module
         self._losses = experiment.losses
 
-    def forward(self, batch: Any, names: Sequence[str]) -> dict[str, Tensor]:
+    def forward(self, share: Share, names: Sequence[str]) -> dict[str, Tensor]:
         """Return the losses of one process's share of a batch, all NaN where the network gave no finite numbers.
 
         Args:
-            batch: The share.
+            share: Of the batch.
             names: Those of the losses of the steps before, none before the first.
 
         Raises:
             InputError: They are not named scalars with a `loss` to minimise among them, or the first are not finite.
         """
         try:
-            losses = self._losses(self.module, batch)
+            losses = self._losses(self.module, share.batch)
         except NonFiniteError:
             if not names:  # the network was never fine
                 raise

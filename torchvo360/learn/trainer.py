@@ -14,7 +14,7 @@ from torch import Tensor, nn
 
 from torchvo360.checks import InputError
 from torchvo360.learn.checkpoint import save_checkpoint
-from torchvo360.learn.experiment import Experiment, Objective
+from torchvo360.learn.experiment import Experiment, Objective, Share
 from torchvo360.learn.processes import join, own_random_numbers, reduced, seed_random_numbers
 from torchvo360.learn.record import TENSORBOARD, Record
 from torchvo360.learn.resume import STATE, Progress, load_state, save_state
@@ -201,7 +201,7 @@ class _Training:
         self.module.train()
         batch = fabric.to_device(self.experiment.batch(progress.step, fabric.global_rank, fabric.world_size))
         buffers = [(buffer, buffer.clone()) for buffer in self.module.buffers()]
-        losses = self.objective(batch, progress.losses)
+        losses = self.objective(Share(batch), progress.losses)
         self.optimizer.zero_grad()
         fabric.backward(losses["loss"])
         length = nn.utils.clip_grad_norm_(self.parameters, self.config.clip_norm or math.inf).item()

@@ -32,7 +32,7 @@ def run_sweep(name: str, schema: type, overrides: Sequence[str], conf: Path) -> 
     out = next((text.removeprefix("out=") for text in reversed(overrides) if text.startswith("out=")), None)
     if out is not None and "," in out:
         raise InputError(f"out: expected one folder for the whole sweep, got {out}.")
-    script = Path(sys.modules["__main__"].__file__ or "").resolve()
+    script = Path(getattr(sys.modules["__main__"], "__file__", None) or "").resolve()
     # A launcher's workers on other machines import this module; PYTHONPATH travels with the environment.
     paths = [str(Path(__file__).parent), os.environ.get("PYTHONPATH", "")]
     os.environ["PYTHONPATH"] = os.pathsep.join(path for path in paths if path)

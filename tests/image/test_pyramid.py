@@ -100,7 +100,7 @@ def test_levels_of_a_masked_image_are_means_of_what_is_known():
     value = noise(2, 4, 8)
     known = noise(4, 8, 2).permute(2, 0, 1) > 0.4
     value[~known] = torch.nan
-    levels = masked_pyramid(value, known, camera, 3)
+    levels = masked_pyramid(value, known, [level_camera(camera, level) for level in range(3)])
     assert torch.equal(levels[0][1], known)
     for level, (mean, certain) in enumerate(levels):
         size = 2**level

@@ -9,7 +9,7 @@ from torch import Tensor
 from torchvo360.alignment.config import AlignConfig
 from torchvo360.alignment.inputs import Inputs
 from torchvo360.cameras import Camera
-from torchvo360.image import blur, blur_radius, level_camera, resample
+from torchvo360.image import blur, blur_radius, level_camera, masked_pyramid, resample
 from torchvo360.residuals.direct import Reference, Target, make_target
 
 
@@ -63,49 +63,41 @@ def _own_levels(inputs: Inputs, camera: Camera, config: AlignConfig, *, branches
     confidence = _confidence(inputs, 0, camera, config.blur_px, branches=branches)
     weight = None if inputs.weight_ref is None else inputs.weight_ref[0]
     ref, tgt = blur(ref, camera, config.blur_px), blur(tgt, camera, config.blur_px)
-    ranges = _Ranges(inputs, known)
-    levels = [_Maps(camera, ref, tgt, *ranges.at(camera), weight, confidence)]
-    for level in range(1, config.level_count(camera)):
-        at = level_camera(camera, level)
+    cameras = [level_camera(camera, level) for level in range(config.level_count(camera))]
+    ranges = _range_levels(inputs, known, cameras)
+    levels = [_Maps(camera, ref, tgt, *ranges[0], weight, confidence)]
+    for at, each in zip(cameras[1:], ranges[1:], strict=True):
         ref, tgt = resample(ref, at), resample(tgt, at)
         confidence, weight = (None if x is None else resample(x, at) for x in (confidence, weight))
-        levels.append(_Maps(at, ref, tgt, *ranges.at(at), weight, confidence))
+        levels.append(_Maps(at, ref, tgt, *each, weight, confidence))
     return levels
 
 
 def _given_levels(inputs: Inputs, camera: Camera, *, branches: bool) -> list[_Maps]:
     """Take a pyramid as it is; only the ranges are brought to its sizes."""
-    ranges = _Ranges(inputs, inputs.known)
+    cameras = [camera.resized(ref.shape[-1], ref.shape[-2]) for ref in inputs.ref]
+    ranges = _range_levels(inputs, inputs.known, cameras)
     levels = []
-    for number, (ref, tgt) in enumerate(zip(inputs.ref, inputs.tgt, strict=True)):
-        at = camera.resized(ref.shape[-1], ref.shape[-2])
-        rho, variance, known = ranges.at(at)
+    for number, (ref, tgt, at) in enumerate(zip(inputs.ref, inputs.tgt, cameras, strict=True)):
+        rho, variance, known = ranges[number]
         confidence = _confidence(inputs, number, at, 0.0, branches=branches)
         weight = None if inputs.weight_ref is None else inputs.weight_ref[number]
         levels.append(_Maps(at, ref, tgt, rho, variance, known & inputs.ref_finite[number], weight, confidence))
     return levels
 
 
-class _Ranges:
-    """Inverse ranges, from level to level: means of what is known, known where at least half of the area is."""
+def _range_levels(
+    inputs: Inputs, known: Bool[Tensor, "B H W"], cameras: list[Camera]
+) -> list[tuple[Tensor, Tensor | None, Tensor]]:
+    """Return inverse ranges, their variances and where they are known, of every level.
 
-    def __init__(self, inputs: Inputs, known: Bool[Tensor, "B H W"]) -> None:
-        self._share = known.to(inputs.rho.dtype)
-        self._total = inputs.rho * self._share
-        self._spread = None if inputs.variance is None else inputs.variance * self._share
-
-    def at(self, camera: Camera) -> tuple[Tensor, Tensor | None, Tensor]:
-        """Return the inverse ranges, their variances and where they are known, at a size below the last one's.
-
-        Errors of neighbouring ranges go together: their mean is no surer than they are.
-        """
-        self._share, self._total = resample(self._share, camera), resample(self._total, camera)
-        share = self._share.clamp_min(1e-6)
-        variance = None
-        if self._spread is not None:
-            self._spread = resample(self._spread, camera)
-            variance = self._spread / share
-        return self._total / share, variance, self._share >= 0.5
+    Errors of neighbouring ranges go together: their mean is no surer than they are.
+    """
+    rho = masked_pyramid(inputs.rho, known, cameras)
+    if inputs.variance is None:
+        return [(mean, None, certain) for mean, certain in rho]
+    variance = masked_pyramid(inputs.variance, known, cameras)
+    return [(mean, spread, certain) for (mean, certain), (spread, _) in zip(rho, variance, strict=True)]
 
 
 def _laid_out(maps: _Maps, intrinsics: Tensor | None, whole: Camera, saturation: float | None) -> Level:

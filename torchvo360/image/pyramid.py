@@ -1,5 +1,7 @@
 """Image pyramids: each level is half as large, so that a pixel at uv lies at uv / 2 (equations.md, section 1)."""
 
+from collections.abc import Sequence
+
 import torch
 import torch.nn.functional as F
 from jaxtyping import Bool, Float
@@ -66,14 +68,19 @@ def pyramid(
 
 
 def masked_pyramid(
-    value: Float[Tensor, "*batch H W"], known: Bool[Tensor, "*batch H W"], camera: Camera, levels: int
+    value: Float[Tensor, "*batch H W"], known: Bool[Tensor, "*batch H W"], cameras: Sequence[Camera]
 ) -> list[tuple[Float[Tensor, "*batch h w"], Bool[Tensor, "*batch h w"]]]:
-    """Return (mean of the known values, where at least half of the area is known) of each level, the finest first."""
+    """Return (mean of the known values, where at least half of the area is known) at each camera's size.
+
+    Args:
+        value: May be anything where it is not known.
+        known: Where it counts.
+        cameras: Each of the size of the one before or smaller.
+    """
     share = known.to(value.dtype)
     total = torch.where(known, value, 0.0)
-    out = [(total, known)]
-    for level in range(1, levels):
-        smaller = level_camera(camera, level)
-        share, total = resample(share, smaller), resample(total, smaller)
+    out: list[tuple[Tensor, Tensor]] = []
+    for camera in cameras:
+        share, total = resample(share, camera), resample(total, camera)
         out.append((total / share.clamp_min(1e-6), share >= 0.5))
     return out

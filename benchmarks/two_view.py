@@ -9,18 +9,27 @@ With a whole reference trajectory (TUM) the scale of each quarter against it is 
 import json
 import sys
 from pathlib import Path
+from typing import Any
 
 import torch
+from jaxtyping import Float64
+from torch import Tensor
 
 from torchvo360 import lie
 from torchvo360.data.registration import associate, similarity_from_points
+from torchvo360.data.trajectory import Trajectory
 from torchvo360.data.tum import read_tum
 
 
-def main() -> None:
-    """Print the medians, and the scales of the quarters."""
-    trajectory = read_tum(sys.argv[1])
-    pairs = json.loads(Path(sys.argv[2]).read_text(encoding="utf-8"))["pairs"]
+def read_pairs(path: str | Path) -> list[dict[str, Any]]:
+    """Return the two-view estimates of a reference."""
+    return json.loads(Path(path).read_text(encoding="utf-8"))["pairs"]
+
+
+def two_view_errors_deg(
+    trajectory: Trajectory, pairs: list[dict[str, Any]]
+) -> tuple[Float64[Tensor, "P"], Float64[Tensor, "P"]]:
+    """Return the errors of rotations and of directions, degrees, for the pairs that the trajectory reaches."""
     pairs = [pair for pair in pairs if pair["j"] < len(trajectory)]
     i, j = (torch.tensor([pair[name] for pair in pairs]) for name in ("i", "j"))
     T_j_i = lie.se3_inverse(trajectory.T_world_cam[j]) @ trajectory.T_world_cam[i]
@@ -29,8 +38,15 @@ def main() -> None:
     centre = lie.se3_inverse(T_j_i)[:, :3, 3]
     wanted = torch.tensor([pair["cam_j_center_dir_in_i"] for pair in pairs], dtype=torch.float64)
     cosine = torch.nn.functional.cosine_similarity(centre, wanted)
-    direction = cosine.clamp(-1, 1).acos().rad2deg()
-    print(f"{len(pairs)} pairs: rotation {rotation.median():.3f} deg, direction {direction.median():.2f} deg (medians)")
+    return rotation, cosine.clamp(-1, 1).acos().rad2deg()
+
+
+def main() -> None:
+    """Print the medians, and the scales of the quarters."""
+    trajectory = read_tum(sys.argv[1])
+    rotation, direction = two_view_errors_deg(trajectory, read_pairs(sys.argv[2]))
+    medians = f"rotation {rotation.median():.3f} deg, direction {direction.median():.2f} deg (medians)"
+    print(f"{len(rotation)} pairs: {medians}")
     if len(sys.argv) > 3:
         reference = read_tum(sys.argv[3])
         ours, theirs = associate(trajectory, reference)

@@ -312,7 +312,7 @@ BAD = {
     # keys and values
     "inptu=x": "inptu: expected a known key such as input, got inptu=x",
     "vo.map.pints=3": "vo.map.points",
-    "keyframe_parallax=3": "vo.map.keyframe_parallax_deg",
+    "keyframe_flow=3": "vo.map.keyframe_flow_deg",
     "qqq=1": "qqq: expected a known key",
     "+qqq=1": "qqq: expected a known key",
     "~start": "~start: expected key=value",
@@ -326,7 +326,7 @@ BAD = {
     "seed=[1": "seed: expected a value",
     "seed=${nope}": "'nope'",
     "camera=stretch": "camera: expected its keys one by one",
-    "vo=fast": "vo: expected one of clean, default, got fast",
+    "vo=quick": "vo: expected one of accurate, clean, default, fast, got quick",
     "clip=nope": "clip: expected one of none, theta_walk, got nope",
     "hydra.nope=1": "hydra.nope",
     "vo.map.points=5": "vo.map.points: expected at least 100, got 5",

@@ -406,3 +406,18 @@ class TestConventions:
     def test_wrong_shapes_are_refused_by_name(self, function: Exp, shape: tuple[int, ...], name: str):
         with pytest.raises(ShapeError, match=rf"^{name}: expected shape \[.*\], got \[{shape[0]}"):
             function(torch.zeros(shape))
+
+
+def test_the_small_adjoint_of_sim3_generates_its_adjoint():
+    xi = 0.8 * torch.randn(20, 7, generator=torch.Generator().manual_seed(3), dtype=torch.float64)
+    adjoint = lie.sim3_adjoint(lie.sim3_exp(xi))
+    torch.testing.assert_close(torch.linalg.matrix_exp(lie.sim3_small_adjoint(xi)), adjoint, atol=1e-11, rtol=0)
+
+
+@pytest.mark.parametrize("size", [0.0, 1e-6, 0.3, 1.5])
+def test_the_left_jacobian_of_sim3_is_that_of_finite_differences(size):
+    xi = size * torch.randn(5, 7, generator=torch.Generator().manual_seed(4), dtype=torch.float64)
+    step = 1e-6 * torch.eye(7, dtype=torch.float64)[:, None]
+    ahead, behind = lie.sim3_exp(xi + step), lie.sim3_exp(xi - step)
+    numeric = lie.sim3_log(ahead @ lie.sim3_inverse(behind)) / 2e-6
+    torch.testing.assert_close(lie.sim3_left_jacobian(xi), numeric.movedim(0, -1), atol=1e-7, rtol=1e-7)

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from torchvo360 import lie
     from torchvo360.alignment import Align, AlignConfig, AlignResult, align
-    from torchvo360.cameras import Equirectangular, Pinhole
+    from torchvo360.cameras import Equirectangular, Pinhole, Rig
     from torchvo360.evaluation import evaluate
     from torchvo360.solve import Status
     from torchvo360.vo import VisualOdometry
@@ -17,6 +17,7 @@ __all__ = [
     "AlignResult",
     "Equirectangular",
     "Pinhole",
+    "Rig",
     "Status",
     "VisualOdometry",
     "align",
@@ -31,6 +32,7 @@ _HOMES = {
     "align": "alignment",
     "Equirectangular": "cameras",
     "Pinhole": "cameras",
+    "Rig": "cameras",
     "evaluate": "evaluation",
     "Status": "solve",
     "VisualOdometry": "vo",

@@ -228,3 +228,25 @@ def sim3_adjoint(S: Float[Tensor, "*batch 4 4"]) -> Float[Tensor, "*batch 7 7"]:
     middle = torch.cat([zero, R, column], -1)
     last = torch.tensor([0.0] * 6 + [1.0], dtype=S.dtype, device=S.device).expand(*S.shape[:-2], 1, 7)
     return torch.cat([top, middle, last], -2)
+
+
+def sim3_small_adjoint(xi: Float[Tensor, "*batch 7"]) -> Float[Tensor, "*batch 7 7"]:
+    """Return ad with `sim3_adjoint(sim3_exp(xi)) == exp(ad)`: what the bracket with a tangent [v, w, s] does."""
+    check_shape("xi", xi, "... 7")
+    v, w, s = xi[..., :3], xi[..., 3:6], xi[..., 6, None, None]
+    turn, zero, column = so3_hat(w), torch.zeros_like(so3_hat(w)), torch.zeros_like(v)[..., None]
+    eye = torch.eye(3, dtype=xi.dtype, device=xi.device)
+    top = torch.cat([turn + s * eye, so3_hat(v), -v[..., None]], -1)
+    middle = torch.cat([zero, turn, column], -1)
+    return torch.cat([top, middle, torch.zeros_like(top[..., :1, :])], -2)
+
+
+def sim3_left_jacobian(xi: Float[Tensor, "*batch 7"]) -> Float[Tensor, "*batch 7 7"]:
+    """Return J_l with `exp(xi + d) = exp(J_l d) exp(xi)` to first order.
+
+    It is the integral of exp(u ad) over u in [0, 1]: the upper right block of the exponential of [[ad, I], [0, 0]].
+    """
+    ad = sim3_small_adjoint(xi)
+    eye = torch.eye(7, dtype=xi.dtype, device=xi.device).expand_as(ad)
+    upper = torch.cat([ad, eye], -1)
+    return _matrix_exp(torch.cat([upper, torch.zeros_like(upper)], -2))[..., :7, 7:]

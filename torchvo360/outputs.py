@@ -31,7 +31,8 @@ from torchvo360.settings import RunConfig
 from torchvo360.viz import plot_trajectory
 from torchvo360.vo import FrameEstimate, OdometryResult
 
-FILES = ("trajectory.txt", "frames.csv", "map.ply", "trajectory.png", "config.yaml", "summary.json")
+BEFORE_LOOPS = "trajectory_before_loops.txt"
+FILES = ("trajectory.txt", BEFORE_LOOPS, "frames.csv", "map.ply", "trajectory.png", "config.yaml", "summary.json")
 """In the order in which they are written: where there is a summary, the run is complete."""
 
 COLUMNS = ("index", "time", "state", "reason", "residual", "inliers", "a", "b", "milliseconds")
@@ -128,6 +129,7 @@ def write_all(folder: Path, record: Record) -> dict[str, Any]:
     summary = summarise(record)
     try:
         write_tum(folder / "trajectory.txt", result.trajectory)
+        write_tum(folder / BEFORE_LOOPS, result.before_loops)
         _write_frames(folder / "frames.csv", result.frames)
         write_ply(folder / "map.ply", result.points.xyz, result.points.rgb)
         if draw:
@@ -170,11 +172,15 @@ def summarise(record: Record) -> dict[str, Any]:
         "states": dict(Counter(str(frame.state) for frame in frames)),
         "coverage": len(record.result.trajectory) / len(frames) if evaluation is None else evaluation.coverage,
         "keyframes": record.result.keyframes,
+        "maps": record.result.maps,
+        "loops": [[edge.i, edge.j] for edge in record.result.loops],
         "points": len(record.result.points.xyz),
         "seconds": record.seconds,
         "fps": len(frames) / record.seconds,
         "odometry_fps": len(frames) / computing_s,
     }
+    if record.result.intrinsics is not None:
+        figures["intrinsics"] = list(record.result.intrinsics)
     if evaluation is not None:
         figures |= {name: getattr(evaluation, name) for name in (*ERRORS, "path_length_m", "pairs")}
     figures |= {"notes": notes, "threads": torch.get_num_threads(), "versions": _versions()}
@@ -186,11 +192,15 @@ def describe(summary: dict[str, Any], folder: Path) -> list[str]:
     states = ", ".join(f"{count} {state}" for state, count in summary["states"].items())
     unusable = ", ".join(f"{count} {problem}" for problem, count in summary["unusable_frames"].items())
     size, speed = f"{summary['width']} x {summary['height']}", f"{summary['fps']:.1f} a second"
+    maps, loops = summary["maps"], len(summary["loops"])
+    parts = f" of {maps} maps" * (maps > 1) + f"; {loops} {'loop' if loops == 1 else 'loops'} closed" * (loops > 0)
     lines = [
         f"{summary['name']}: {summary['frames']} frames of {size} in {summary['seconds']:.1f} s, {speed}",
         f"states: {states}" + (f"; unusable frames: {unusable}" if unusable else ""),
-        f"map: {summary['points']} points from {summary['keyframes']} keyframes",
+        f"map: {summary['points']} points from {summary['keyframes']} keyframes{parts}",
     ]
+    if "intrinsics" in summary:
+        lines.append("intrinsics fx, fy, cx, cy: " + ", ".join(_figure(value) for value in summary["intrinsics"]))
     if figures := [*(name for name in ERRORS if name in summary)]:
         figures += ["coverage", "fps"]
         width = max(map(len, figures))

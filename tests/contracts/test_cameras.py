@@ -12,6 +12,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 from torch.func import jacfwd, vmap
+from torch.nn.functional import normalize
 
 from torchvo360 import lie
 from torchvo360.cameras import Camera, Equirectangular, Pinhole, check_image_size
@@ -218,6 +219,9 @@ class TestRoundTrips:
         ray, g_uv = p_cam / camera.scale(p_cam)[..., None], random_pixels(camera, batch, 3).to(dtype)
         eps = torch.finfo(dtype).eps
         close(torch.stack(camera.pixel_of(*p_cam.unbind(-1)), -1), camera.pixel(p_cam), 0)
+        normalized = torch.stack(camera.normalized_of(*p_cam.unbind(-1)), -1).double()
+        k = intrinsics_of(camera)
+        close_pixels(camera, normalized * k[:2] + k[2:], camera.pixel(p_cam).double(), 8 * eps * camera.width)
         close(camera.scale_of(*p_cam.unbind(-1)), camera.scale(p_cam), 4 * eps * RANGES[1])
         x, y, z = ray.unbind(-1)
         close(torch.stack(camera.covector_of((x, y, z), *g_uv.unbind(-1)), -1), camera.covector(ray, g_uv), 0)
@@ -263,6 +267,21 @@ class TestDerivatives:
         k, pixels = intrinsics_of(camera), random_pixels(camera, (50,))
         expected = vmap(jacfwd(lambda k, uv: reference_ray(camera, k, uv)), in_dims=(None, 0))(k, pixels)
         close(camera.ray_jacobian_intrinsics(pixels), expected, 1e-14)
+        unit = vmap(jacfwd(lambda k, uv: normalize(reference_ray(camera, k, uv), dim=0)), in_dims=(None, 0))(k, pixels)
+        close(camera.unit_ray_jacobian_intrinsics(pixels), unit, 1e-14)
+
+    @on_every_camera
+    def test_ray_by_intrinsics_that_stand_in(self, camera: Camera):
+        pixels = random_pixels(camera, (50,))
+        k = intrinsics_of(camera) + torch.tensor([[0.3, -0.2, 1.4, -0.7], [-0.1, 0.4, 0.0, 0.5]], dtype=torch.float64)
+        by_k = vmap(jacfwd(lambda k, uv: reference_ray(camera, k, uv)), in_dims=(None, 0))
+        expected = torch.stack([by_k(each, pixels) for each in k])
+        fx, fy, cx, cy = k[:, :, None].unbind(1)
+        close(camera.ray_jacobian_intrinsics(pixels, (fx, fy, cx, cy)), expected, 1e-14)
+        rays = camera.ray(pixels, (fx, fy, cx, cy))
+        length = torch.linalg.vector_norm(rays, dim=-1)[..., None, None]
+        across = torch.eye(3, dtype=torch.float64) - rays[..., None] * rays[..., None, :] / length**2
+        close(camera.unit_ray_jacobian_intrinsics(pixels, (fx, fy, cx, cy)), across @ expected / length, 1e-14)
 
     @on_every_camera
     def test_scale_by_point(self, camera: Camera):
@@ -304,6 +323,33 @@ class TestCovector:
         G = camera.covector(rays, g_uv)
         norms = torch.linalg.vector_norm(G, dim=-1) * torch.linalg.vector_norm(rays, dim=-1)
         assert bool(((G * rays).sum(-1).abs() <= 8 * torch.finfo(dtype).eps * norms).all())
+
+    @on_every_camera
+    @in_every_dtype
+    def test_the_gradient_comes_back_from_it(self, camera: Camera, dtype: torch.dtype):
+        points = regular_points(camera)
+        rays = beyond_the_first_row(camera, points / camera.scale(points)[..., None]).to(dtype)
+        g_uv = random_pixels(camera, (len(rays),), 5).to(dtype)
+        fx, fy, cx, cy = (part + 0.3 for part in camera.intrinsics)
+        for k in (None, (fx, fy, cx, cy)):
+            x, y, z = rays.unbind(-1)
+            G = camera.covector_of((x, y, z), g_uv[:, 0], g_uv[:, 1], k)
+            back = torch.stack(camera.gradient_of((x, y, z), G, k), -1)
+            close(back, g_uv, 1e-13 * camera.width if dtype == torch.float64 else 1e-5 * camera.width)
+
+    @on_full_spheres
+    @in_every_dtype
+    def test_within_the_first_row_the_gradient_that_comes_back_falls_to_zero(
+        self, camera: Equirectangular, dtype: torch.dtype
+    ):
+        first_row = 0.5 / abs(camera.intrinsics[1])
+        angle = first_row * torch.tensor([1.0, 0.5, 1e-2, 1e-6, 0.0], dtype=torch.float64)
+        x, y, z = (part.to(dtype) for part in (0.6 * angle.sin(), -angle.cos(), 0.8 * angle.sin()))
+        one = torch.ones(5, dtype=dtype)
+        g_u, g_v = camera.gradient_of((x, y, z), camera.covector_of((x, y, z), one, one))
+        held = (angle.sin() / math.sin(first_row)).to(dtype)
+        close(g_u, held**2, 1e-5)
+        close(g_v, held, 1e-5)
 
     @on_full_spheres
     @in_every_dtype

@@ -259,7 +259,7 @@ def test_a_panorama_is_worn_by_the_walls_and_seen_unchanged_from_its_centre(tmp_
 
 
 def test_the_callers_mistakes_are_named(worlds, tmp_path):
-    with pytest.raises(InputError, match="world: expected one of room, pillars, courtyard, got 'cave'"):
+    with pytest.raises(InputError, match="world: expected one of room, pillars, courtyard, field, got 'cave'"):
         make_world("cave")
     with pytest.raises(InputError, match="panorama: expected the path of a readable image, got"):
         make_world("room", panorama=tmp_path / "none.png")

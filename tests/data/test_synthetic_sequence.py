@@ -11,6 +11,7 @@ from torchvo360.cameras import Equirectangular, Pinhole
 from torchvo360.checks import InputError
 from torchvo360.data.synthetic import WORLDS, SyntheticConfig, SyntheticSequence, make_world, sample_pairs
 from torchvo360.data.synthetic.motion import MOTIONS, trajectory
+from torchvo360.data.synthetic.sequence import MAX_BASELINE
 from torchvo360.lie import se3_inverse, so3_angle
 
 MIDDLE = 75
@@ -72,7 +73,8 @@ def test_every_path_stays_in_free_space_and_is_smooth(name):
     world = make_world(name, seed=9, moving_objects=2)
     for motion in MOTIONS:
         for seed in range(5):
-            poses = trajectory(motion, world.walkway, 150, 30.0, seed=seed)
+            frames = 300 if motion == "turned_loop" else 150
+            poses = trajectory(motion, world.walkway, frames, 30.0, seed=seed)
             at = poses[:, :3, 3]
             for t in (0.0, 1.5, 3.0):
                 assert world.clearance(at, t).min() > 0.3
@@ -104,6 +106,87 @@ def test_motions_are_what_their_names_say(plain):
             assert (ahead.sum(-1) > 0).all()
         down = walk[:, 2, 1]
         assert (down < -0.95).all()
+
+
+def test_a_walk_with_a_stop_stands_still_for_its_time_and_goes_on_smoothly(plain):
+    walkway = plain.world.walkway
+    walk = trajectory("walk", walkway, 150, 30.0, seed=1)
+    for motion, begin, end in (("pause", 53, 97), ("turn", 30, 120), ("turn_first", 0, 90)):
+        poses = trajectory(motion, walkway, 150, 30.0, seed=1)
+        step = poses[:, :3, 3].diff(dim=0).norm(dim=-1)
+        assert step[begin:end].max() < 1e-12
+        before, after = step[: max(0, begin - 1)], step[end + 2 :]
+        assert min(before.min() if len(before) else 1, after.min()) > 1e-6
+        assert after[16:].min() > 0.02, "at full speed half a second later"
+        turn = turns(poses)[begin:end]
+        if motion == "pause":
+            assert turn.max() < 1e-6
+        else:
+            assert math.degrees(turn.sum()) > 235
+            assert math.degrees(turn.max()) < 3.5
+        # no kicks, neither where it stops nor where it goes on
+        assert poses[:, :3, 3].diff(dim=0).diff(dim=0).norm(dim=-1).max() < 0.005
+        assert turns(poses).diff().abs().max() < math.radians(0.4)
+        if begin > 20:  # until it slows down it is the walk
+            torch.testing.assert_close(poses[: begin - 15], walk[: begin - 15])
+    short = trajectory("pause", walkway, 20, 30.0, seed=1)
+    assert short[:, :3, 3].diff(dim=0).norm(dim=-1).max() < 1e-12, "shorter than its stop"
+
+
+def test_the_turned_loop_comes_back_to_its_first_place_and_looks_another_way(plain):
+    walkway = plain.world.walkway
+    for seed in range(3):
+        loop, turned = (trajectory(motion, walkway, 300, 30.0, seed=seed) for motion in ("loop", "turned_loop"))
+        assert torch.equal(turned[:, :3, 3], loop[:, :3, 3])
+        torch.testing.assert_close(turned[0], loop[0])
+        closing = turned[[-1, 0]]
+        assert closing[:, :3, 3].diff(dim=0).norm() < 0.05
+        assert math.degrees(turns(closing).item()) > 140
+
+
+@pytest.mark.parametrize("share", [0.1, 1 / 3])
+@pytest.mark.parametrize("world", ["room", "courtyard"])
+def test_a_moving_object_covers_its_share_of_the_sphere_all_the_time(world, share):
+    plain, covered = (SyntheticSequence(small(world=world, moving_share=s, frames=120)) for s in (0.0, share))
+    area = plain.camera.solid_angle(plain.camera.pixel_grid())
+    shares, middles = [], []
+    for index in range(0, 120, 17):
+        (image, reach), (spoiled, nearer) = plain.render(index), covered.render(index)
+        hidden = nearer < reach
+        assert torch.equal(nearer[~hidden], reach[~hidden])
+        shares.append(float(area[hidden].sum() / area.sum()))
+        # it stands out, with a texture of its own
+        assert (spoiled - image)[:, hidden].abs().mean() > 0.05
+        assert spoiled[:, hidden].std(-1).min() > 0.05
+        p_cam = plain.camera.ray_grid()[hidden].mean(0).double()
+        middles.append((covered.pose(index)[:3, :3] @ p_cam)[:2])
+    assert sum(shares) / len(shares) == pytest.approx(share, rel=0.03)
+    assert min(shares) > 0.85 * share
+    assert max(shares) < 1.15 * share
+    # it sways about the camera
+    at = torch.stack(middles)
+    bearing = torch.atan2(at[:, 1], at[:, 0])
+    assert torch.sin(bearing[:, None] - bearing).abs().max() > math.sin(math.radians(20))
+
+
+def test_a_moving_object_changes_nothing_else_and_is_the_same_for_one_seed():
+    settings = {"frames": 40, "world": "pillars", "moving_objects": 1}
+    first, again, other = (SyntheticSequence(small(**settings, moving_share=s)) for s in (0.2, 0.2, 0.0))
+    assert torch.equal(first.truth.T_world_cam, other.truth.T_world_cam)
+    assert np.array_equal(first.frame(30).image, again.frame(30).image)
+    reach, plain = first.range(30), other.range(30)
+    assert torch.equal(reach[reach >= plain], plain[reach >= plain])
+
+
+def test_the_field_has_sky_over_half_of_the_view_without_structure():
+    sequence = SyntheticSequence(small(world="field", frames=90))
+    area = sequence.camera.solid_angle(sequence.camera.pixel_grid())
+    for index in (0, 45, 89):
+        image, reach = sequence.render(index)
+        sky = reach.isinf()
+        assert 0.46 < float(area[sky].sum() / area.sum()) < 0.5
+        assert image[:, sky].std(-1).max() < 0.03
+        assert image[:, ~sky].std(-1).min() > 0.08
 
 
 @pytest.mark.parametrize("jump_deg", [20.0, -45.0])
@@ -138,6 +221,19 @@ def test_exposure_steps_change_the_brightness_abruptly_and_clip():
     torch.testing.assert_close(shown.float(), expected, atol=0.51, rtol=0)
 
 
+def test_exposure_jumps_by_two_stops_and_clips_what_is_too_bright():
+    sequence = SyntheticSequence(small(exposure="jumps", motion="still", frames=60))
+    assert sequence.gains[[0, 19, 20, 39, 40]].tolist() == [0.5, 0.5, 2.0, 2.0, 0.5]
+    dark, bright = (sequence.frame(k).image.astype(np.float64) for k in (19, 20))
+    clipped = bright == 255
+    assert 0.1 < clipped.mean() < 0.9
+    assert np.abs(dark * 4 - bright)[~clipped].max() <= 2.5
+    colour, _ = sequence.render(20)
+    expected = (2 * colour).clamp(0, 1) * 255
+    shown = torch.from_numpy(sequence.frame(20).image).permute(2, 0, 1)
+    torch.testing.assert_close(shown.float(), expected, atol=0.51, rtol=0)
+
+
 def test_exposure_drifts_slowly_within_its_bounds():
     sequence = SyntheticSequence(small(exposure="drift"))
     assert sequence.gains.diff().abs().max() < 0.03
@@ -154,21 +250,79 @@ def test_noise_has_its_deviation_and_differs_between_frames(plain):
     assert abs(np.corrcoef((first - clean)[inner], (second - clean)[inner])[0, 1]) < 0.05
 
 
+@pytest.mark.parametrize("camera", ["equirectangular", "pinhole"])
+@pytest.mark.parametrize(("axis", "offset"), [("x", (0.2, 0.0, 0.0)), ("y", (0.0, 0.2, 0.0))])
+def test_a_stereo_pair_shows_what_the_moved_camera_sees_at_the_same_time(camera, axis, offset):
+    settings = {"camera": camera, "frames": 30, "exposure": "drift", "moving_objects": 2}
+    single = SyntheticSequence(small(**settings))
+    pair = SyntheticSequence(small(**settings, stereo_baseline=0.2, stereo_axis=axis))
+    assert single.rig is None
+    assert pair.rig is not None
+    assert pair.rig.cameras == (pair.camera, pair.camera)
+    assert pair.rig.baseline(1) == pytest.approx(0.2)
+    assert torch.equal(single.truth.T_world_cam, pair.truth.T_world_cam)
+    alone, frame = single.frame(20), pair.frame(20)
+    assert alone.others == ()
+    assert np.array_equal(alone.image, frame.image)
+    T_world_second = pair.pose(20).clone()
+    T_world_second[:3, 3] += T_world_second[:3, :3] @ torch.tensor(offset, dtype=torch.float64)
+    assert frame.image is not None
+    colour, _ = pair.world.render(pair.camera, T_world_second, t=20 / 30)
+    expected = (float(pair.gains[20]) * colour + float(pair.offsets[20])).clamp(0, 1) * 255
+    (second,) = frame.others
+    assert second.dtype == np.uint8
+    torch.testing.assert_close(torch.from_numpy(second).permute(2, 0, 1).float(), expected, atol=0.51, rtol=0)
+    assert not np.array_equal(second, frame.image)
+    T_second_first = pair.rig.T_other_first(1)
+    torch.testing.assert_close(T_second_first, se3_inverse(T_world_second) @ pair.pose(20), atol=1e-12, rtol=0)
+
+
+def test_the_noise_of_a_stereo_pair_is_independent_and_leaves_the_first_image_alone():
+    noisy, clean = (SyntheticSequence(small(noise=noise, stereo_baseline=0.1)).frame(3) for noise in (0.05, 0.0))
+    single = SyntheticSequence(small(noise=0.05)).frame(3)
+    assert np.array_equal(single.image, noisy.image)
+    first, second = (noisy.image, clean.image), (noisy.others[0], clean.others[0])
+    inner = (np.minimum(first[1], second[1]) > 64) & (np.maximum(first[1], second[1]) < 191)
+    noise = [(seen.astype(np.float64) - true)[inner] / 255 for seen, true in (first, second)]
+    assert noise[1].std() == pytest.approx(0.05, rel=0.05)
+    assert abs(np.corrcoef(*noise)[0, 1]) < 0.05
+
+
+@pytest.mark.parametrize("name", WORLDS)
+def test_the_second_camera_stays_in_free_space(name):
+    world = make_world(name, seed=9, moving_objects=2)
+    for seed in range(5):
+        poses = trajectory("walk", world.walkway, 150, 30.0, seed=seed)
+        for axis in range(2):
+            at = poses[:, :3, 3] + MAX_BASELINE * poses[:, :3, axis]
+            for t in (0.0, 1.5, 3.0):
+                assert world.clearance(at, t).min() > 0.1
+
+
 @pytest.mark.parametrize(
     ("settings", "sentence"),
     [
-        ({"world": "cave"}, "world: expected one of room, pillars, courtyard, got 'cave'."),
+        ({"world": "cave"}, "world: expected one of room, pillars, courtyard, field, got 'cave'."),
         ({"camera": "fisheye"}, "camera: expected one of equirectangular, pinhole, got 'fisheye'."),
-        ({"motion": "fly"}, "motion: expected one of walk, loop, rotation, still, got 'fly'."),
-        ({"exposure": "auto"}, "exposure: expected one of constant, steps, drift, got 'auto'."),
+        ({"motion": "fly"}, f"motion: expected one of {', '.join(MOTIONS)}, got 'fly'."),
+        ({"exposure": "auto"}, "exposure: expected one of constant, steps, jumps, drift, got 'auto'."),
         ({"frames": 0}, "frames: expected an integer of at least 1, got 0."),
         ({"seed": 2**32}, "seed: expected at most 4294967295, got 4294967296."),
         ({"frames": 2.5}, "frames: expected an integer of at least 1, got 2.5."),
         ({"width": 300, "height": 200}, "width: expected twice the height for a panorama, got 300 x 200."),
         ({"fps": 0.0}, "fps: expected a finite number above 0 at most 1e+06, got 0.0."),
         ({"fov_deg": 180.0}, "fov_deg: expected a finite number above 0 at most 170, got 180.0."),
+        ({"stereo_baseline": -0.1}, "stereo_baseline: expected 0 or a number from 0.001 to 0.4, got -0.1."),
+        ({"stereo_baseline": math.nan}, "stereo_baseline: expected 0 or a number from 0.001 to 0.4, got nan."),
+        (
+            {"moving_share": 0.2, "stereo_baseline": 0.1},
+            "moving_share: expected 0 with a second camera, got 0.2.",
+        ),
+        ({"stereo_axis": "z"}, "stereo_axis: expected one of x, y, got 'z'."),
         ({"noise": -0.1}, "noise: expected a number from 0 to 1, got -0.1."),
         ({"noise": math.nan}, "noise: expected a number from 0 to 1, got nan."),
+        ({"moving_share": 0.5}, "moving_share: expected a number from 0 to 0.4, got 0.5."),
+        ({"moving_share": math.nan}, "moving_share: expected a number from 0 to 0.4, got nan."),
         ({"moving_objects": -1}, "moving_objects: expected an integer of at least 0, got -1."),
         ({"yaw_jump_deg": math.inf}, "yaw_jump_deg: expected a finite number from -180 to 180, got inf."),
     ],

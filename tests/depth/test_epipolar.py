@@ -12,7 +12,7 @@ from torchvo360.cameras import Camera, Equirectangular, Pinhole
 from torchvo360.checks import InputError
 from torchvo360.data.synthetic import make_world
 from torchvo360.data.synthetic.motion import trajectory
-from torchvo360.depth.epipolar import EpipolarConfig, EpipolarMatch, _great_circles, search_great_circles
+from torchvo360.depth.epipolar import EpipolarConfig, EpipolarMatch, great_circles, search_great_circles
 from torchvo360.image import blur, gradient_magnitude, select_pixels
 from torchvo360.residuals.direct import make_target
 
@@ -40,14 +40,14 @@ def test_the_angle_of_an_inverse_range_is_where_the_point_is_seen(t):
     at_infinity = T[:3, :3].numpy() @ ray.numpy()
     cross = np.linalg.norm(np.cross(at_infinity, point, axis=0), axis=0)
     expected = np.arctan2(cross, (at_infinity * point).sum(0))
-    circles = _great_circles(ray, T)
+    circles = great_circles(ray, T)
     np.testing.assert_allclose(circles.angle(rho).numpy(), expected, atol=1e-12)
     on_circle = circles.start * circles.angle(rho).cos() + circles.towards * circles.angle(rho).sin()
     np.testing.assert_allclose(on_circle.numpy(), point / np.linalg.norm(point, axis=0), atol=1e-9)
 
 
 def test_angle_and_inverse_range_are_each_other_s_inverse_with_the_right_slope():
-    circles = _great_circles(random_directions(400, 1), motion((0.3, -0.1, 0.2)))
+    circles = great_circles(random_directions(400, 1), motion((0.3, -0.1, 0.2)))
     rho = torch.linspace(0, 3, 400, dtype=torch.float64)
     theta = circles.angle(rho)
     kept = (circles.sine > 0.1) & (theta < circles.phi - 0.01)
@@ -227,7 +227,7 @@ def search_stripes(image: Tensor, half_width_px: float) -> EpipolarMatch:
     T = motion((0.1, 0.0, 0.0), (0.0, 0.0, 0.0))
     # tan(theta) = rho t sin(phi) / (1 + rho t cos(phi)): solved for the rho that moves each ray by theta
     theta = 8 * camera.pixel_angle
-    circles = _great_circles(ray, T.float())
+    circles = great_circles(ray, T.float())
     rho = circles.rho(torch.full((80,), theta))
     sigma = half_width_px / 2 * camera.pixel_angle * circles.rho_by_angle(torch.full((80,), theta))
     target = make_target(image[None, None].roll(8, -1), camera)

@@ -59,7 +59,7 @@ def test_a_keyframe_has_one_strong_point_a_cell_in_pixel_order(scene):
     assert bool((key.pixel.diff() > 0).all())
     assert int(key.pixel[0]) >= 0
     assert int(key.pixel[-1]) < 256 * 128
-    cell = equal_area_cells(CAMERA, CONFIG.map.points).flatten()[key.pixel]
+    cell = equal_area_cells(CAMERA, CONFIG.map.start_points).flatten()[key.pixel]
     assert len(cell.unique()) == len(cell)
     assert float(key.slope.min()) >= CONFIG.map.min_gradient
     torch.testing.assert_close(key.ray.norm(dim=0), torch.ones(len(key.pixel)))
@@ -92,21 +92,35 @@ def test_points_at_infinity_turn_with_the_camera_and_stay_at_infinity(scene):
     ray, rho = key.moved(scene.T_cam_key)
     torch.testing.assert_close(ray, scene.T_cam_key[:3, :3].float() @ key.ray)
     assert float(rho.abs().max()) == 0
-    assert key.median_parallax(scene.T_cam_key) < 1e-3
+    assert key.mean_flow(scene.T_cam_key) < 1e-6
 
 
-def test_the_median_parallax_is_the_angle_between_infinity_and_the_points_in_use(scene):
+def test_the_mean_flow_is_the_angle_between_infinity_and_the_points_in_use(scene):
+    """In float64 and by another formula; at no motion, and at a half turn without motion, it is 0 and not noise."""
     key = scene.key()
-    ray, _ = key.moved(scene.T_cam_key)
-    turned = scene.T_cam_key[:3, :3].float() @ key.ray
-    angle = torch.acos((ray * turned).sum(0).double().clamp(-1, 1))
-    assert key.median_parallax(scene.T_cam_key) == pytest.approx(float(angle.median()), rel=0.02)
-    assert key.median_parallax(EYE) < 1e-3
+    ray, rho = key.ray.double(), key.points.rho.double()
+    turned = scene.T_cam_key[:3, :3] @ ray
+    moved = turned + rho * scene.T_cam_key[:3, 3:]
+    angle = torch.acos((moved * turned).sum(0) / moved.norm(dim=0) / turned.norm(dim=0))
+    assert key.mean_flow(scene.T_cam_key) == pytest.approx(float(angle.mean()), rel=1e-4)
+    half_turn = lie.se3(lie.so3_exp(torch.tensor([0.0, math.pi, 0.0]).double()), torch.zeros(3).double())
+    assert key.mean_flow(EYE) < 1e-6
+    assert key.mean_flow(half_turn) < 1e-6
     nearest = key.points.rho > key.points.rho.median()
     key.points = key.points._replace(score=nearest.float())
-    assert key.median_parallax(scene.T_cam_key) == pytest.approx(float(angle[nearest].median()), rel=0.02)
+    assert key.mean_flow(scene.T_cam_key) == pytest.approx(float(angle[nearest].mean()), rel=1e-4)
     key.points = key.points._replace(score=torch.zeros_like(key.points.score))
-    assert key.median_parallax(scene.T_cam_key) == 0.0
+    assert key.mean_flow(scene.T_cam_key) == 0.0
+
+
+def test_the_mean_flow_past_a_point_is_more_than_a_right_angle(scene):
+    key = scene.key()
+    ray = torch.tensor([[0.0], [0.0], [1.0]])
+    one = torch.ones(1)
+    key = replace(key, ray=ray, points=InverseRange(one, 0.01 * one, one))
+    T = EYE.clone()
+    T[:3, 3] = torch.tensor([1e-2, 0.0, -2.0], dtype=torch.float64)
+    assert key.mean_flow(T) == pytest.approx(math.pi - math.atan2(1e-2, 1.0), rel=1e-5)
 
 
 def origins(key: KeyPoints, new: Keyframe, T_cam_key: Tensor) -> tuple[Tensor, Tensor]:
@@ -162,7 +176,7 @@ def test_after_the_hand_over_there_is_one_point_a_cell_in_pixel_order(scene):
     assert bool((new.pixel.diff() > 0).all())
     assert int(new.pixel[0]) >= 0
     assert int(new.pixel[-1]) < 256 * 128
-    cell = equal_area_cells(CAMERA, CONFIG.map.points).flatten()[new.pixel]
+    cell = equal_area_cells(CAMERA, CONFIG.map.start_points).flatten()[new.pixel]
     assert len(cell.unique()) == len(cell)
     u, v = CAMERA.pixel_of(*new.ray)
     assert bool(((new.pixel % 256) == (u % 256).long().clamp(max=255)).all())
@@ -229,30 +243,51 @@ def test_a_frame_without_texture_gives_an_empty_keyframe(scene):
     blank = scene.builder.build(scene.frames[0].colour * 0 + 90, 0, 0)
     key = make_keyframe(blank, EYE, scene.builder, CONFIG.map)
     assert len(key.pixel) == 0
-    assert len(to_cloud(key, 0.05).xyz) == 0
+    assert len(to_cloud(key.ray, key.points.rho, key.pixel, blank).xyz) == 0
+    assert key.mean_flow(scene.T_cam_key) == 0.0
 
 
-def test_the_cloud_has_the_trusted_points_in_the_world_with_their_colours(scene):
+def test_the_cloud_has_the_points_in_their_own_camera_with_their_colours_but_none_at_infinity(scene):
     key = scene.key()
-    key.T_world_key = lie.se3_exp(torch.tensor([1.0, 2.0, 3.0, 0.1, 0.5, -0.2], dtype=torch.float64))
-    rho, variance, score = key.points
-    rho, score = rho.clone(), score.clone()
-    rho[0], score[1] = 0.0, 0.0
-    key.points = InverseRange(rho, variance, score)
-    cloud = to_cloud(key, 0.05)
+    rho = key.points.rho.clone()
+    rho[0], rho[1] = 0.0, 5e-4
+    cloud = to_cloud(key.ray, rho, key.pixel, key.frame)
     assert len(cloud.xyz) == len(key.pixel) - 2
-    p_key = (cloud.xyz.double() - key.T_world_key[:3, 3]) @ key.T_world_key[:3, :3]
-    torch.testing.assert_close(p_key / p_key.norm(dim=-1)[:, None], key.ray[:, 2:].T.double(), rtol=0, atol=1e-5)
-    torch.testing.assert_close(p_key.norm(dim=-1).float(), scene.range[key.pixel[2:]], rtol=1e-4, atol=1e-4)
+    xyz = cloud.xyz.double()
+    torch.testing.assert_close(xyz / xyz.norm(dim=-1)[:, None], key.ray[:, 2:].T.double(), rtol=0, atol=1e-5)
+    torch.testing.assert_close(cloud.xyz.norm(dim=-1), scene.range[key.pixel[2:]], rtol=1e-4, atol=1e-4)
     expected = torch.from_numpy(scene.frames[0].colour).reshape(-1, 3)[key.pixel[2:]]
     assert torch.equal(cloud.rgb, expected)
     assert len(join_clouds([cloud, cloud]).xyz) == 2 * len(cloud.xyz)
-    assert len(join_clouds([]).xyz) == 0
+    assert join_clouds([]).xyz.shape == (0, 3)
+    assert join_clouds([]).rgb.dtype == torch.uint8
+
+
+def test_a_cloud_moves_by_a_similarity_its_scale_included(scene):
+    key = scene.key()
+    cloud = to_cloud(key.ray, key.points.rho, key.pixel, key.frame)
+    T = lie.se3_exp(torch.tensor([1.0, 2.0, 3.0, 0.1, 0.5, -0.2], dtype=torch.float64))
+    S = T.clone()
+    S[:3, :3] *= 2.5
+    moved = cloud.moved(S)
+    back = (moved.xyz.double() - T[:3, 3]) @ T[:3, :3] / 2.5
+    torch.testing.assert_close(back.float(), cloud.xyz, rtol=1e-4, atol=1e-4)
+    assert torch.equal(moved.rgb, cloud.rgb)
 
 
 @pytest.mark.parametrize(
     ("name", "value"),
-    [("points", 10), ("max_keyframe_gap", 0), ("min_gradient", 0.0), ("keyframe_parallax_deg", math.inf)],
+    [
+        ("points", 99),
+        ("start_points", 99),
+        ("max_keyframe_gap", 0),
+        ("min_gradient", 0.0),
+        ("keyframe_flow_deg", math.inf),
+        ("keyframe_flow_deg", 0.0),
+        ("max_difference", -1.0),
+        ("max_keyframe_gain", 0.0),
+        ("min_visible", 1.1),
+    ],
 )
 def test_unusable_settings_are_refused_by_name(name, value):
     with pytest.raises(InputError, match=name):

@@ -22,10 +22,11 @@ from torchvo360.vo import FrameEstimate, OdometryConfig, OdometryResult, State, 
 from torchvo360.vo.frame import PyramidFrame
 
 WIDTH, STEP_NS = 256, 33_333_333
+CLEAN = OdometryConfig(blur_px=0.5)
 WORDS = {
     "ok", "first_frame", "low_parallax", "few_tracks", "few_inliers", "low_cheirality", "refinement_failed",
     "low_agreement", "no_agreement", "restarting", "new_map", "present_keyframe", "earlier_keyframe",
-    "start_corrected", "bad_frame_black", "bad_frame_unreadable",
+    "start_corrected", "maps_joined", "bad_frame_black", "bad_frame_unreadable",
 }  # fmt: skip
 PLACED = (State.TRACKING, State.WEAK, State.RELOCALISED)
 
@@ -112,8 +113,13 @@ def check_complete(recording: Recording, result: OdometryResult) -> None:
         assert estimate.milliseconds > 0
         assert math.isnan(estimate.inliers) or 0 <= estimate.inliers <= 1
         assert (estimate.state == State.TRACKING) <= (estimate.reason in ("ok", "start_corrected"))
+        assert estimate.reason != "earlier_keyframe" or estimate.inliers >= OdometryConfig().weak_inliers
     assert bool(result.points.xyz.isfinite().all())
     assert len(result.points.xyz) == len(result.points.rgb)
+    assert result.before_loops.t_ns.tolist() == result.trajectory.t_ns.tolist()
+    if not result.loops:
+        assert torch.equal(result.before_loops.T_world_cam, result.trajectory.T_world_cam)
+    assert result.intrinsics is None
 
 
 def states(result: OdometryResult) -> list[State]:
@@ -143,29 +149,31 @@ def errors(result: OdometryResult, recording: Recording, keep: Sequence[int] | N
     [{"world": "room"}, {"world": "pillars", "exposure": "steps"}, {"world": "courtyard", "yaw_jump_deg": 20.0}],
     ids=["room", "pillars", "courtyard"],
 )
-def test_on_three_worlds_of_150_frames_the_ate_is_at_most_0_4_percent(settings):
+def test_on_three_worlds_of_150_frames_the_ate_is_at_most_0_03_percent(settings):
     recording = Recording.rendered(frames=150, width=512, height=256, **settings)
-    result = run(recording)
+    result = run(recording, config=CLEAN)
     figures = errors(result, recording)
-    assert figures.ate_percent <= 0.4
+    assert figures.ate_percent <= 0.03
     assert figures.coverage == 1.0
-    assert figures.rotation_median_deg < 0.2
+    assert figures.rotation_median_deg < 0.03
     assert {estimate.state for estimate in after_start(result)} == {State.TRACKING}
-    assert result.keyframes >= 5
-    assert len(result.points.xyz) > 10_000
+    assert result.maps == 1
+    assert result.keyframes >= 10
+    per_keyframe = len(result.points.xyz) / result.keyframes
+    assert 0.55 * CLEAN.map.points < per_keyframe <= CLEAN.map.points, "half of the courtyard is sky"
 
 
 @pytest.mark.parametrize(("world", "seed"), [("room", 4), ("pillars", 7), ("courtyard", 11)])
 def test_other_worlds_of_half_the_size_are_followed_too(world, seed):
     recording = Recording.rendered(world=world, frames=60, seed=seed)
     result = run(recording)
-    assert errors(result, recording).ate_percent < 0.4
+    assert errors(result, recording).ate_percent < 0.1
     assert {estimate.state for estimate in after_start(result)} == {State.TRACKING}
 
 
 def test_moving_objects_are_survived():
     recording = Recording.rendered(frames=60, seed=2, moving_objects=3)
-    assert errors(run(recording), recording).ate_percent < 0.5
+    assert errors(run(recording), recording).ate_percent < 0.15
 
 
 @pytest.fixture(scope="module")
@@ -181,7 +189,7 @@ def plain(walk: Recording) -> OdometryResult:
 
 def test_the_undisturbed_walk_is_accurate(walk, plain):
     figures = errors(plain, walk)
-    assert figures.ate_percent < 0.2
+    assert figures.ate_percent < 0.08
     assert figures.coverage == 1.0
     assert len(after_start(plain)) >= 64
     torch.testing.assert_close(plain.trajectory.T_world_cam[0], torch.eye(4, dtype=torch.float64), rtol=0, atol=1e-9)
@@ -248,8 +256,8 @@ def test_frames_that_cannot_be_used_get_a_prediction_and_the_run_goes_on(walk, p
         assert result.frames[index].reason == f"bad_frame_{problem}"
     assert result.frames[dark.stop].state == State.TRACKING
     good = [k for k in range(len(walk)) if k not in dark]
-    assert errors(result, walk, good).ate_percent < 0.3
-    assert errors(result, walk).ate_percent < 1.5
+    assert errors(result, walk, good).ate_percent < 0.1
+    assert errors(result, walk).ate_percent < 0.8
     assert State.LOST not in states(result)
 
 
@@ -258,7 +266,7 @@ def test_bad_frames_at_the_start_and_at_the_end_are_survived(walk):
     result = run(short.without_images(range(6), "black"))
     assert [estimate.reason for estimate in result.frames[:6]] == ["bad_frame_black"] * 6
     assert states(result)[:6] == [State.INITIALISING] * 6
-    assert errors(result, short, range(6, 24)).ate_percent < 1
+    assert errors(result, short, range(6, 24)).ate_percent < 0.2
     result = run(short.without_images(range(18, 24), "unreadable"))
     assert states(result)[18:] == [State.WEAK] * 6
     result = run(short.without_images(range(24), "black"))
@@ -283,7 +291,7 @@ def test_a_hand_over_the_lens_is_lost_and_what_follows_is_found(walk, count, tur
     assert all(result.frames[k].state == State.LOST for k in covered)
     assert result.frames[covered.stop].state == State.RELOCALISED
     good = [k for k in range(len(walk)) if k not in covered]
-    assert errors(result, turned, good).ate_percent < 0.3
+    assert errors(result, turned, good).ate_percent < 0.1
     assert states(result)[covered.stop + 1 :] == [State.TRACKING] * (len(walk) - covered.stop - 1)
 
 
@@ -295,7 +303,7 @@ def test_a_turn_that_ends_in_the_dark_is_caught():
     result = run(turned.without_images(dark, "black"))
     assert State.LOST not in states(result)
     good = [k for k in range(len(walk)) if k not in dark]
-    assert errors(result, turned, good).ate_percent < 0.4
+    assert errors(result, turned, good).ate_percent < 0.12
 
 
 # Bad motion and light
@@ -308,8 +316,8 @@ def test_a_random_yaw_every_five_frames_is_followed(walk):
     turned = walk.rolled(jumps[: len(walk)].tolist())
     result = run(turned)
     figures = errors(result, turned)
-    assert figures.ate_percent < 0.3
-    assert figures.rotation_median_deg < 0.3
+    assert figures.ate_percent < 0.1
+    assert figures.rotation_median_deg < 0.1
     assert {estimate.state for estimate in after_start(result)} <= {State.TRACKING, State.WEAK}
 
 
@@ -323,14 +331,14 @@ def test_uneven_time_is_survived(walk, kind):
     }[kind]
     recording = walk.pick(order)
     result = run(recording)
-    assert errors(result, recording).ate_percent < 0.4
+    assert errors(result, recording).ate_percent < 0.12
     assert State.LOST not in states(result)
 
 
 def test_heavy_noise_is_survived():
     recording = Recording.rendered(world="courtyard", frames=40, seed=0, noise=0.06, width=512, height=256)
     result = run(recording)
-    assert errors(result, recording).ate_percent < 0.4
+    assert errors(result, recording).ate_percent < 0.25
     assert State.LOST not in states(result)
 
 
@@ -338,7 +346,7 @@ def test_heavy_noise_is_survived():
 def test_the_exposure_jumping_by_two_stops_is_survived(walk, low, high):
     spoiled = walk.with_images(lambda k, image: image * (low if (k // 8) % 2 else high))
     result = run(spoiled)
-    assert errors(result, walk).ate_percent < 0.6
+    assert errors(result, walk).ate_percent < 0.15
     assert State.LOST not in states(result)
     gains = [estimate.a for estimate in result.frames if not math.isnan(estimate.a)]
     assert max(gains) - min(gains) > math.log(3)
@@ -347,7 +355,7 @@ def test_the_exposure_jumping_by_two_stops_is_survived(walk, low, high):
 def test_a_standstill_before_and_within_the_walk_costs_nothing(walk):
     recording = walk.pick([*[0] * 15, *range(40), *[40] * 15, *range(40, 70)])
     result = run(recording)
-    assert errors(result, recording).ate_percent < 0.3
+    assert errors(result, recording).ate_percent < 0.1
     assert set(states(result)[:15]) == {State.INITIALISING}
     standing = result.trajectory.positions[56:68]
     step = result.trajectory.positions[40:50].diff(dim=0).norm(dim=-1).mean()
@@ -379,7 +387,7 @@ def test_a_camera_that_only_turns_has_rotations_and_starts_when_it_walks():
     assert states(result)[-1] == State.TRACKING
     offset = (turning.T_world_cam[-1, :3, 3] - T[0, :3, 3]).norm()
     assert float(offset) < 0.15, "the recording jumps a little between its parts"
-    assert errors(result, recording, range(26, len(recording))).ate_percent < 1.5
+    assert errors(result, recording, range(26, len(recording))).ate_percent < 0.1
 
 
 # Losses
@@ -397,7 +405,7 @@ def test_a_jump_back_is_found_in_an_earlier_keyframe():
     assert first <= 105 + 3
     assert {estimate.state for estimate in result.frames[first + 1 :]} == {State.TRACKING}
     placed = [*range(105), *range(first, len(recording))]
-    assert errors(result, recording, placed).ate_percent < 0.4, "both visits lie in one world"
+    assert errors(result, recording, placed).ate_percent < 0.1, "both visits lie in one world"
 
 
 @pytest.mark.slow
@@ -411,7 +419,7 @@ def test_another_world_in_the_middle_is_lost_and_the_first_one_found_again(walk)
     assert set(reasons) <= {"new_map", "earlier_keyframe", "present_keyframe"}
     assert states(result)[-10:] == [State.TRACKING] * 10
     assert all(state in PLACED for state in states(result)[72:])
-    assert errors(result, recording, [*range(40), *range(72, 100)]).ate_percent < 0.3, "both visits lie in one world"
+    assert errors(result, recording, [*range(40), *range(72, 100)]).ate_percent < 0.1, "both visits lie in one world"
 
 
 @pytest.mark.slow
@@ -427,7 +435,7 @@ def test_what_never_comes_back_is_restarted_and_joined(walk):
     assert states(result)[-1] == State.TRACKING
     # the new map is accurate in itself, and begins where the old one ended
     second = range(30 + restart, len(recording))
-    assert errors(result, recording, second).ate_percent < 1.0
+    assert errors(result, recording, second).ate_percent < 0.3
     joint = result.trajectory.positions[30 + restart - 1] - result.trajectory.positions[29]
     assert float(joint.norm()) < 0.2 * float(result.trajectory.positions[29].norm())
     assert len(result.points.xyz) > len(run(walk.pick(range(30))).points.xyz)
@@ -473,18 +481,48 @@ def retained_frames() -> int:
 
 @pytest.mark.parametrize("stop_after", [None, 4, 5], ids=["walk", "stops_at_the_start", "stops_after_it"])
 def test_frames_are_not_retained(walk, stop_after):
-    """Also where the camera stops before its start has been checked, which then has to wait."""
+    """The window's keyframes and the last frame found; where the camera stops before its start is checked, what waits."""
     before = retained_frames()
     order = list(range(70)) if stop_after is None else [*range(stop_after), *[stop_after - 1] * 66]
     odometry = VisualOdometry(walk.camera)
     for frame in walk.pick(order).frames:
         odometry.step(frame)
-    waiting = OdometryConfig().initialise.max_pending
-    assert retained_frames() - before <= (2 if stop_after is None else waiting + 2)
+    config = OdometryConfig()
+    held = config.window.keyframes + 1
+    assert 2 <= retained_frames() - before <= (held if stop_after is None else held + config.initialise.max_pending)
+    odometry.finish()
+    assert retained_frames() - before <= (held if stop_after is None else held + config.initialise.max_pending)
+    del odometry
+    assert retained_frames() == before
 
 
-def test_the_pose_of_a_past_frame_holds_no_larger_tensor_alive(plain):
-    for estimate in plain.frames:
+def test_every_keyframe_leaves_less_than_half_a_megabyte(walk):
+    """What is held in the end, less what is held once the window is full, by the keyframes in between: all tensors."""
+    odometry, held = VisualOdometry(walk.camera), []
+    for frame in walk.pick([*range(70), *range(69, 0, -3)]).frames:
+        odometry.step(frame)
+        if frame.index in (49, 92):
+            held.append((odometry.finish().keyframes, held_bytes()))
+    (fewer, before), (more, after) = held
+    assert fewer >= OdometryConfig().window.keyframes
+    assert more >= fewer + 4
+    assert (after - before) / (more - fewer) < 0.5 * 2**20
+
+
+def held_bytes() -> int:
+    """Return the bytes of all tensors' storages."""
+    gc.collect()
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        things = [each for each in gc.get_objects() if type(each) is Tensor]
+        storages = {each.untyped_storage().data_ptr(): each.untyped_storage().nbytes() for each in things}
+    return sum(storages.values())
+
+
+def test_the_pose_of_a_past_frame_holds_no_larger_tensor_alive(walk, plain):
+    odometry = VisualOdometry(walk.camera)
+    online = [odometry.step(frame) for frame in walk.frames[:20]]
+    for estimate in [*plain.frames, *online]:
         assert estimate.T_world_cam.untyped_storage().nbytes() == 8 * 16
 
 
@@ -528,5 +566,5 @@ def test_a_mask_keeps_an_operator_out_who_turns_with_the_camera(walk):
     mask[88:] = False
     recording = walk.pick(range(40)).with_images(covered)
     result = run(recording, mask=mask)
-    assert errors(result, recording).ate_percent < 0.5
+    assert errors(result, recording).ate_percent < 0.25
     assert State.LOST not in states(result)

@@ -122,17 +122,29 @@ def counting(monkeypatch: pytest.MonkeyPatch) -> Callable[[], int]:
     return lambda: len(calls)
 
 
-def test_a_lost_frame_costs_a_few_searches_and_the_next_goes_on_where_it_ended(place, monkeypatch):
+def test_the_most_like_keyframe_is_tried_first_however_long_ago_it_was(place, monkeypatch):
     count = counting(monkeypatch)
     recovery = place.recovery()
-    target = place.key(0)
+    target, elsewhere = place.key(0), Place("courtyard", 8).key(0)
     recovery.remember(target)
-    other = Place("courtyard", 8)
-    elsewhere = other.key(0)
     for _ in range(2 * TRIED_PER_FRAME):
         recovery.remember(elsewhere)
+    answer = recovery.relocalise(place.frame(1, TURNS[0]), CONFIG.weak_inliers)
+    assert answer is not None
+    assert answer[0].T_world_key is target.T_world_key
+    assert count() == 1
+
+
+def test_a_lost_frame_costs_a_few_searches_and_the_next_goes_on_where_it_ended(place, monkeypatch):
+    """Keyframes that look like the frame but whose points do not fit come first; the right one last."""
+    count = counting(monkeypatch)
+    recovery = place.recovery()
+    frame, target = place.frame(1, TURNS[0]), place.key(0)
+    recovery.remember(target)
+    mistaken = replace(Place("courtyard", 8).key(0), frame=frame)
+    for _ in range(2 * TRIED_PER_FRAME):
+        recovery.remember(mistaken)
     assert len(recovery) == 2 * TRIED_PER_FRAME + 1
-    frame = place.frame(1, TURNS[0])
     assert recovery.relocalise(frame, CONFIG.weak_inliers) is None
     assert count() == TRIED_PER_FRAME
     assert recovery.relocalise(frame, CONFIG.weak_inliers) is None
@@ -140,6 +152,10 @@ def test_a_lost_frame_costs_a_few_searches_and_the_next_goes_on_where_it_ended(p
     assert answer is not None
     assert answer[0].T_world_key is target.T_world_key
     assert count() == 2 * TRIED_PER_FRAME + 1
+    assert recovery.relocalise(frame, CONFIG.weak_inliers) is None, "it begins again after an answer"
+    assert recovery.relocalise(frame, CONFIG.weak_inliers, afresh=True) is None
+    assert recovery.relocalise(frame, CONFIG.weak_inliers) is None
+    assert recovery.relocalise(frame, CONFIG.weak_inliers) is not None
 
 
 def test_nothing_remembered_is_nothing_found_and_forgetting_keeps_the_first(place):

@@ -1,6 +1,7 @@
 """Tracking: from wrong predictions, under other exposures, with noisy inverse ranges, and when it must fail."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -40,7 +41,7 @@ class Scene:
         noise = torch.randn(self.rho.shape, generator=torch.Generator().manual_seed(seed))
         rho = (self.rho * (1 + relative_sigma * noise)).clamp_min(1e-3)
         points = InverseRange(rho, (claimed * self.rho) ** 2, torch.ones_like(rho))
-        return Keyframe(EYE, self.base.pixel, self.base.ray, self.base.slope, self.base.values, points, self.base.frame)
+        return replace(self.base, points=points)
 
     def frame(self, gain: float = 1.0, offset: float = 0.0) -> PyramidFrame:
         image = np.clip(self.images[1] * gain + 255 * offset, 0, 255).astype(np.uint8)

@@ -79,6 +79,12 @@ class Camera(ABC):
         """
 
     @abstractmethod
+    def normalized_of(
+        self, x: Float[Tensor, "*batch"], y: Float[Tensor, "*batch"], z: Float[Tensor, "*batch"]
+    ) -> tuple[Float[Tensor, "*batch"], Float[Tensor, "*batch"]]:
+        """Return a point's normalised coordinates, `(u - cx) / fx` and `(v - cy) / fy`; finite everywhere."""
+
+    @abstractmethod
     def covector_of(
         self,
         ray: tuple[Float[Tensor, "*batch"], Float[Tensor, "*batch"], Float[Tensor, "*batch"]],
@@ -87,6 +93,15 @@ class Camera(ABC):
         k: Intrinsics | None = None,
     ) -> tuple[Float[Tensor, "*batch"], Float[Tensor, "*batch"], Float[Tensor, "*batch"]]:
         """Return the three components of `covector`, for the hot path."""
+
+    @abstractmethod
+    def gradient_of(
+        self,
+        ray: tuple[Float[Tensor, "*batch"], Float[Tensor, "*batch"], Float[Tensor, "*batch"]],
+        G: tuple[Float[Tensor, "*batch"], Float[Tensor, "*batch"], Float[Tensor, "*batch"]],
+        k: Intrinsics | None = None,
+    ) -> tuple[Float[Tensor, "*batch"], Float[Tensor, "*batch"]]:
+        """Return g_u and g_v of a covector on its ray: what `covector_of` was given, where that is exact."""
 
     def pixel(self, p_cam: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 2"]:
         """Return the pixel of a point without seam handling or validity; finite everywhere."""
@@ -122,8 +137,22 @@ class Camera(ABC):
         return torch.stack(self.covector_of((x, y, z), g_uv[..., 0], g_uv[..., 1]), -1)
 
     @abstractmethod
-    def ray_jacobian_intrinsics(self, uv: Float[Tensor, "*batch 2"]) -> Float[Tensor, "*batch 3 4"]:
-        """Return d ray / d (fx, fy, cx, cy)."""
+    def ray_jacobian_intrinsics(
+        self, uv: Float[Tensor, "*batch 2"], k: Intrinsics | None = None
+    ) -> Float[Tensor, "*batch 3 4"]:
+        """Return d ray / d (fx, fy, cx, cy) at a fixed pixel."""
+
+    def unit_ray_jacobian_intrinsics(
+        self, uv: Float[Tensor, "*batch 2"], k: Intrinsics | None = None
+    ) -> Float[Tensor, "*batch 3 4"]:
+        """Return d (ray / |ray|) / d (fx, fy, cx, cy) at a fixed pixel: `(I - r r^T) J / |ray|` with r the unit ray.
+
+        It serves points held by unit rays and inverse distance, whatever measure the camera has.
+        """
+        ray, J_ray_k = self.ray(uv, k), self.ray_jacobian_intrinsics(uv, k)
+        inv_length = torch.linalg.vector_norm(ray, dim=-1).reciprocal()[..., None, None]
+        unit = ray[..., None] * inv_length
+        return (J_ray_k - unit * (unit.mT @ J_ray_k)) * inv_length
 
     @abstractmethod
     def pixel_jacobian_point(self, p_cam: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 2 3"]:
@@ -140,6 +169,10 @@ class Camera(ABC):
     @abstractmethod
     def resized(self, width: int, height: int) -> Self:
         """Return the same camera for an image resampled to another size, such as a pyramid level."""
+
+    @abstractmethod
+    def recalibrated(self, fx: float, fy: float, cx: float, cy: float) -> Self:
+        """Return the camera with other intrinsics; whether its image wraps stays as it is."""
 
     @property
     def pixel_angle(self) -> float:

@@ -30,6 +30,8 @@ class Equirectangular(Camera):
     fy: float | None = None
     cx: float | None = None
     cy: float | None = None
+    full: bool | None = None
+    """Whether the image is the full sphere whatever the intrinsics say, as while they are estimated; None: by them."""
 
     @property
     def intrinsics(self) -> tuple[float, float, float, float]:
@@ -42,6 +44,8 @@ class Equirectangular(Camera):
 
     @property
     def wraps(self) -> bool:
+        if self.full is not None:
+            return self.full
         fx, fy, _, cy = self.intrinsics
         return (
             math.isclose(fx, self.width / math.tau, rel_tol=1e-9)
@@ -87,6 +91,12 @@ class Equirectangular(Camera):
         if k is not None or not (self.wraps and cx == self.width / 2):
             u = torch.remainder(u, self._period if self.wraps else abs(fx) * math.tau)
         return u, minus_lat * -fy + cy
+
+    def normalized_of(
+        self, x: Float[Tensor, "*batch"], y: Float[Tensor, "*batch"], z: Float[Tensor, "*batch"]
+    ) -> tuple[Float[Tensor, "*batch"], Float[Tensor, "*batch"]]:
+        lon, minus_lat = self._longitude_minus_latitude_of(x, y, z)
+        return lon, -minus_lat
 
     def _longitude_minus_latitude_of(
         self, x: Float[Tensor, "*batch"], y: Float[Tensor, "*batch"], z: Float[Tensor, "*batch"]
@@ -144,15 +154,31 @@ class Equirectangular(Camera):
         Gz = torch.addcmul(radial * z, turn, x, value=-1)
         return Gx, -along_lat * horizontal2 * inv_cos_lat, Gz
 
-    def ray_jacobian_intrinsics(self, uv: Float[Tensor, "*batch 2"]) -> Float[Tensor, "*batch 3 4"]:
-        fx, fy, _, _ = self.intrinsics
-        lon, lat = self._longitude_latitude(uv)
+    def gradient_of(
+        self,
+        ray: tuple[Float[Tensor, "*batch"], Float[Tensor, "*batch"], Float[Tensor, "*batch"]],
+        G: tuple[Float[Tensor, "*batch"], Float[Tensor, "*batch"], Float[Tensor, "*batch"]],
+        k: Intrinsics | None = None,
+    ) -> tuple[Float[Tensor, "*batch"], Float[Tensor, "*batch"]]:
+        fx, fy, _, _ = self.intrinsics if k is None else k
+        (x, y, z), (Gx, Gy, Gz) = ray, G
+        # d ray / du = (z, 0, -x) / fx and d ray / dv = e_lat / fy. Nearer to a pole than the first row's centre G is
+        # held back, and so are these: there they fall to 0 with cos(lat).
+        horizontal = torch.addcmul(x * x, z, z).add(AXIS_SHIFT**2).sqrt()
+        along_lat = (x * Gx + z * Gz) * (y / horizontal) - horizontal * Gy
+        return (z * Gx - x * Gz) / fx, along_lat / fy
+
+    def ray_jacobian_intrinsics(
+        self, uv: Float[Tensor, "*batch 2"], k: Intrinsics | None = None
+    ) -> Float[Tensor, "*batch 3 4"]:
+        fx, fy, _, _ = self.intrinsics if k is None else k
+        lon, lat = self._longitude_latitude(uv, k)
         sin_lon, cos_lon, sin_lat, cos_lat = lon.sin(), lon.cos(), lat.sin(), lat.cos()
         d_lon = torch.stack([cos_lat * cos_lon, torch.zeros_like(lon), -cos_lat * sin_lon], -1)
         d_lat = torch.stack([-sin_lat * sin_lon, -cos_lat, -sin_lat * cos_lon], -1)
-        return torch.stack(
-            [d_lon * (-lon / fx)[..., None], d_lat * (-lat / fy)[..., None], d_lon / -fx, d_lat / -fy], -1
-        )
+        by_u, by_v = torch.ones_like(lon) / -fx, torch.ones_like(lat) / -fy
+        rates = torch.stack([lon * by_u, lat * by_v, by_u, by_v], -1)
+        return torch.stack([d_lon, d_lat, d_lon, d_lat], -1) * rates[..., None, :]
 
     def pixel_jacobian_point(self, p_cam: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 2 3"]:
         fx, fy, _, _ = self.intrinsics
@@ -167,11 +193,9 @@ class Equirectangular(Camera):
         return torch.stack([du, dv], -2) * ~axis[..., None, None]
 
     def pixel_jacobian_intrinsics(self, p_cam: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 2 4"]:
-        lon, minus_lat = self._longitude_minus_latitude_of(*p_cam.unbind(-1))
+        lon, lat = self.normalized_of(*p_cam.unbind(-1))
         zero, one = torch.zeros_like(lon), torch.ones_like(lon)
-        return torch.stack(
-            [torch.stack([lon, zero, one, zero], -1), torch.stack([zero, -minus_lat, zero, one], -1)], -2
-        )
+        return torch.stack([torch.stack([lon, zero, one, zero], -1), torch.stack([zero, lat, zero, one], -1)], -2)
 
     def solid_angle(self, uv: Float[Tensor, "*batch 2"]) -> Float[Tensor, "*batch"]:
         fx, fy, _, _ = self.intrinsics
@@ -185,4 +209,7 @@ class Equirectangular(Camera):
         if self.wraps and self.cx is None:
             return type(self)(width, height)
         by_u, by_v = width / self.width, height / self.height
-        return type(self)(width, height, fx * by_u, fy * by_v, cx * by_u, cy * by_v)
+        return type(self)(width, height, fx * by_u, fy * by_v, cx * by_u, cy * by_v, self.full)
+
+    def recalibrated(self, fx: float, fy: float, cx: float, cy: float) -> Self:
+        return type(self)(self.width, self.height, fx, fy, cx, cy, self.wraps)

@@ -57,9 +57,15 @@ class Pinhole(Camera):
         k: Intrinsics | None = None,
     ) -> tuple[Float[Tensor, "*batch"], Float[Tensor, "*batch"]]:
         fx, fy, cx, cy = self.intrinsics if k is None else k
+        a, b = self.normalized_of(x, y, z)
+        return a * fx + cx, b * fy + cy
+
+    def normalized_of(
+        self, x: Float[Tensor, "*batch"], y: Float[Tensor, "*batch"], z: Float[Tensor, "*batch"]
+    ) -> tuple[Float[Tensor, "*batch"], Float[Tensor, "*batch"]]:
         # Points at or behind the plane z = 0 get a finite pixel, and `sees` refuses them.
         inv_z = z.clamp_min(MIN_DEPTH).reciprocal()
-        return x * inv_z * fx + cx, y * inv_z * fy + cy
+        return x * inv_z, y * inv_z
 
     def project(self, p_cam: Float[Tensor, "*batch 3"]) -> tuple[Float[Tensor, "*batch 2"], Bool[Tensor, "*batch"]]:
         check_shape("p_cam", p_cam, "... 3")
@@ -85,13 +91,25 @@ class Pinhole(Camera):
         Gx, Gy = g_u * fx, g_v * fy
         return Gx, Gy, -(Gx * x + Gy * y)
 
-    def ray_jacobian_intrinsics(self, uv: Float[Tensor, "*batch 2"]) -> Float[Tensor, "*batch 3 4"]:
-        x, y, one = self.ray(uv).unbind(-1)
+    def gradient_of(
+        self,
+        ray: tuple[Float[Tensor, "*batch"], Float[Tensor, "*batch"], Float[Tensor, "*batch"]],
+        G: tuple[Float[Tensor, "*batch"], Float[Tensor, "*batch"], Float[Tensor, "*batch"]],
+        k: Intrinsics | None = None,
+    ) -> tuple[Float[Tensor, "*batch"], Float[Tensor, "*batch"]]:
+        fx, fy, _, _ = self.intrinsics if k is None else k
+        return G[0] / fx, G[1] / fy
+
+    def ray_jacobian_intrinsics(
+        self, uv: Float[Tensor, "*batch 2"], k: Intrinsics | None = None
+    ) -> Float[Tensor, "*batch 3 4"]:
+        fx, fy, _, _ = self.intrinsics if k is None else k
+        x, y, one = self.ray(uv, k).unbind(-1)
         zero = torch.zeros_like(x)
         return torch.stack(
             [
-                torch.stack([-x / self.fx, zero, -one / self.fx, zero], -1),
-                torch.stack([zero, -y / self.fy, zero, -one / self.fy], -1),
+                torch.stack([-x / fx, zero, -one / fx, zero], -1),
+                torch.stack([zero, -y / fy, zero, -one / fy], -1),
                 torch.stack([zero, zero, zero, zero], -1),
             ],
             -2,
@@ -118,6 +136,9 @@ class Pinhole(Camera):
     def solid_angle(self, uv: Float[Tensor, "*batch 2"]) -> Float[Tensor, "*batch"]:
         length = torch.linalg.vector_norm(self.ray(uv), dim=-1)
         return 1 / (abs(self.fx * self.fy) * length**3)
+
+    def recalibrated(self, fx: float, fy: float, cx: float, cy: float) -> Self:
+        return type(self)(self.width, self.height, fx, fy, cx, cy)
 
     def resized(self, width: int, height: int) -> Self:
         by_u, by_v = width / self.width, height / self.height

@@ -23,6 +23,9 @@ class Frame:
     """Colours in the order red, green, blue; None where the image could not be read."""
     problem: str = ""
     """Empty for a good frame, else one word that says why it cannot be used: unreadable, black, white, size, nan."""
+    others: tuple[UInt8[np.ndarray, "H W 3"] | None, ...] = ()
+    """Images of a rig's further cameras at the same time, in the rig's order, None for one that is missing; empty for a
+    single camera."""
 
 
 class ImageSequence(Protocol):

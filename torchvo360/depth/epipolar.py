@@ -64,7 +64,7 @@ class EpipolarMatch(NamedTuple):
     """Whether a clear match was found."""
 
 
-class _Circles(NamedTuple):
+class GreatCircles(NamedTuple):
     """The great circles of all points: `start cos(theta) + towards sin(theta)` for theta from 0 to phi."""
 
     start: Float[Tensor, "3 N"]
@@ -73,21 +73,34 @@ class _Circles(NamedTuple):
     sine: Float[Tensor, "N"]
     baseline: Float[Tensor, ""]
 
-    def angle(self, rho: Tensor) -> Tensor:
+    def angle(self, rho: Float[Tensor, "N"]) -> Float[Tensor, "N"]:
+        """Return where points of these inverse distances lie on their circles."""
         along = rho * self.baseline
         return torch.atan2(along * self.sine, 1 + along * self.phi.cos())
 
-    def rho(self, theta: Tensor) -> Tensor:
-        return theta.sin() / (self.baseline * (self.phi - theta).clamp_min(1e-3).sin())
+    def rho(self, theta: Float[Tensor, "N *places"]) -> Float[Tensor, "N *places"]:
+        """Return the inverse distances of places on the circles."""
+        phi = self.phi.view(-1, *[1] * (theta.ndim - 1))
+        return theta.sin() / (self.baseline * (phi - theta).clamp_min(1e-3).sin())
 
-    def rho_by_angle(self, theta: Tensor) -> Tensor:
+    def rho_by_angle(self, theta: Float[Tensor, "N"]) -> Float[Tensor, "N"]:
+        """Return d rho / d theta."""
         return self.sine / (self.baseline * (self.phi - theta).clamp_min(1e-3).sin() ** 2)
 
-    def take(self, index: Tensor) -> "_Circles":
-        return _Circles(self.start[:, index], self.towards[:, index], self.phi[index], self.sine[index], self.baseline)
+    def take(self, index: Tensor) -> "GreatCircles":
+        """Return some of the circles."""
+        return GreatCircles(
+            self.start[:, index], self.towards[:, index], self.phi[index], self.sine[index], self.baseline
+        )
 
 
-def _great_circles(ray: Float[Tensor, "3 N"], T_tgt_ref: Float[Tensor, "4 4"]) -> _Circles:
+def great_circles(ray: Float[Tensor, "3 N"], T_tgt_ref: Float[Tensor, "4 4"]) -> GreatCircles:
+    """Return the great circles in a target image on which the points of a reference image may lie.
+
+    Args:
+        ray: The points' unit rays in the reference camera.
+        T_tgt_ref: The known motion.
+    """
     R, t = T_tgt_ref[:3, :3], T_tgt_ref[:3, 3]
     baseline = torch.linalg.vector_norm(t).clamp_min(1e-12)
     epipole = (t / baseline)[:, None]
@@ -96,7 +109,7 @@ def _great_circles(ray: Float[Tensor, "3 N"], T_tgt_ref: Float[Tensor, "4 4"]) -
     across = epipole - cosine * start
     # Not vector_norm: over the leading axis it is ten times slower.
     sine = across.square().sum(0).sqrt()
-    return _Circles(start, across / sine.clamp_min(1e-6), torch.atan2(sine, cosine), sine, baseline)
+    return GreatCircles(start, across / sine.clamp_min(1e-6), torch.atan2(sine, cosine), sine, baseline)
 
 
 def search_great_circles(
@@ -125,8 +138,8 @@ def search_great_circles(
     """
     step = target.camera.pixel_angle
     T, affine = T_tgt_ref.to(ray), affine.to(ray)
-    circles = _great_circles(ray, T)
-    samples = _reference_samples(reference, ray, circles, T, step)
+    circles = great_circles(ray, T)
+    samples = reference_samples(reference, ray, circles, T, step)
     samples = samples * affine[0].exp() + affine[1]
     slope2_along = samples.diff(dim=1).square().mean(1)
 
@@ -162,8 +175,8 @@ def search_great_circles(
     return EpipolarMatch(out_rho, out_variance, searched, found)
 
 
-def _reference_samples(
-    reference: Target, ray: Float[Tensor, "3 N"], circles: _Circles, T: Float[Tensor, "4 4"], step: float
+def reference_samples(
+    reference: Target, ray: Float[Tensor, "3 N"], circles: GreatCircles, T: Float[Tensor, "4 4"], step: float
 ) -> Float[Tensor, "N 5"]:
     """Look up five samples of the reference along each point's own epipolar curve, one pixel apart."""
     towards = T[:3, :3].mT @ circles.towards
@@ -173,7 +186,7 @@ def _reference_samples(
 
 def _search(
     target: Target,
-    circles: _Circles,
+    circles: GreatCircles,
     samples: Float[Tensor, "M 5"],
     middle: Float[Tensor, "M"],
     half_width: Float[Tensor, "M"],

@@ -14,7 +14,7 @@ from jaxtyping import Float, Float64
 from torch import Tensor
 
 from torchvo360.cameras import Camera, Intrinsics
-from torchvo360.image import interpolate, locate, pad_image
+from torchvo360.image import Interpolated, interpolate, locate, pad_image
 
 MIN_CONFIDENCE = 0.99
 """Looked-up pixels of less confidence than this touch a masked one."""
@@ -106,19 +106,43 @@ def look_up_usable(target: Target, ray: Float[Tensor, "3 *points"]) -> Float[Ten
         target: One image (batch 1) of one channel.
         ray: Rays in the image's camera.
     """
+    return _look_up_usable(target, ray)[0].value[0, 0].view(ray.shape[1:])
+
+
+def look_up_gradient(
+    target: Target, ray: Float[Tensor, "3 *points"]
+) -> tuple[Float[Tensor, "*points"], Float[Tensor, "*points"]]:
+    """Return what `look_up_usable` does, and the squares of the gradients, per pixel of the image's middle.
+
+    Args:
+        target: One image (batch 1) of one channel.
+        ray: Unit rays in the image's camera.
+    """
+    (value, g_u, g_v), Y = _look_up_usable(target, ray)
+    x, y, z = Y.unsqueeze(1).unbind(2)
+    inv_scale = target.camera.scale_of(x, y, z).reciprocal()
+    G = target.camera.covector_of((x * inv_scale, y * inv_scale, z * inv_scale), g_u, g_v)
+    slope2 = sum((part.square() for part in G), start=torch.zeros_like(g_u)) * target.camera.pixel_angle**2
+    return value[0, 0].view(ray.shape[1:]), slope2[0, 0].view(ray.shape[1:])
+
+
+def _look_up_usable(target: Target, ray: Float[Tensor, "3 *points"]) -> tuple[Interpolated, Float[Tensor, "1 3 N"]]:
+    """Interpolate along rays, with NaN where nothing usable is seen, and return the rays as [1, 3, N]."""
     x, y, z = (component.reshape(1, -1) for component in ray)
     camera = target.camera
     u, v = camera.pixel_of(x, y, z)
     taps = locate(u, v, camera)
-    value = interpolate(target.padded, taps).value[0, 0]
+    found = interpolate(target.padded, taps)
+    value = found.value
     if target.confidence is not None:
-        value = value.masked_fill(interpolate(target.confidence, taps).value[0, 0] < MIN_CONFIDENCE, torch.nan)
+        unsure = interpolate(target.confidence, taps).value < MIN_CONFIDENCE
+        value = value.masked_fill(unsure, torch.nan)
     if target.saturation is not None:
         value = value.masked_fill(value >= target.saturation, torch.nan)
     seen = camera.sees(torch.stack([x, y, z], -1), torch.stack([u, v], -1), margin=0.5)
     if seen is not None:
-        value = value.masked_fill(~seen[0], torch.nan)
-    return value.view(ray.shape[1:])
+        value = value.masked_fill(~seen[:, None], torch.nan)
+    return found._replace(value=value), torch.stack([x, y, z], 1)
 
 
 class Samples(NamedTuple):
@@ -206,6 +230,42 @@ def by_rho(samples: Samples, t_tgt_ref: Float[Tensor, "B 3"]) -> Float[Tensor, "
     tx, ty, tz = t_tgt_ref[..., None, None].unbind(1)
     Gx, Gy, Gz = samples.G
     return (Gx * tx + Gy * ty + Gz * tz) * samples.inv_scale
+
+
+def by_intrinsics(
+    samples: Samples, target: Target, dray_tgt: Float[Tensor, "B 3 4 N"] | None = None
+) -> Float[Tensor, "B 4 M"]:
+    """Return the derivative of the residual by the intrinsics k = (fx, fy, cx, cy); M = C N.
+
+        dI/dk = (g_u a_u, g_v a_v, g_u, g_v) + G . d(R r1)/dk / s          (equations.md, section 3)
+
+    The first part is the target's projection at a fixed point, the second the host's ray, which turns when its pixel
+    stays: with one k for both images the two nearly cancel. The inverse range and the host's value are held.
+
+    k is what `Camera` says of it: it stands in for projection and rays, while the wrap stays the camera's. A full
+    panorama has fx tied to its width, and only cx, cy and fy are free: by fx the derivative is that of the longitude in
+    (-pi, pi] about cx, and jumps by 2 pi g_u where that interval ends. There a host's pixel and its projection may
+    also lie on two sides of the jump.
+
+    It is exact where G is. Nearer to a pole than the first row's centre both parts are held back like the rows by pose,
+    and they are 0 on the pole.
+
+    Args:
+        samples: From `look_up` in this target.
+        target: The images, with their camera and intrinsics.
+        dray_tgt: Derivatives of the reference rays that `look_up` was given by k, rotated into the target:
+            `R_tgt_host @ camera.ray_jacobian_intrinsics(uv_host, k)`, of unit rays `unit_ray_jacobian_intrinsics`.
+            None where the rays do not depend on this k.
+    """
+    camera = target.camera
+    _, k_of_channels = _broadcast(target.intrinsics)
+    g_u, g_v = camera.gradient_of(samples.ray, samples.G, k_of_channels)
+    a_u, a_v = camera.normalized_of(*samples.ray)
+    rows = torch.stack([g_u * a_u, g_v * a_v, g_u, g_v], 1)
+    if dray_tgt is not None:
+        for G, moved in zip(samples.G, dray_tgt[..., None, :].unbind(1), strict=True):
+            rows = torch.addcmul(rows, (G * samples.inv_scale)[:, None], moved)
+    return rows.flatten(2)
 
 
 def system_rows(samples: Samples, root_weight: Float[Tensor, "B C N"]) -> Float[Tensor, "B 9 M"]:

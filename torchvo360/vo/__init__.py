@@ -1,8 +1,18 @@
 """Visual odometry: from frames to poses and a map."""
 
+from torchvo360.vo.begin import LEARNED, STEREO
 from torchvo360.vo.cloud import PointCloud
 from torchvo360.vo.config import OdometryConfig
 from torchvo360.vo.state import FrameEstimate, State
-from torchvo360.vo.system import LEARNED, OdometryResult, VisualOdometry
+from torchvo360.vo.system import OdometryResult, VisualOdometry
 
-__all__ = ["LEARNED", "FrameEstimate", "OdometryConfig", "OdometryResult", "PointCloud", "State", "VisualOdometry"]
+__all__ = [
+    "LEARNED",
+    "STEREO",
+    "FrameEstimate",
+    "OdometryConfig",
+    "OdometryResult",
+    "PointCloud",
+    "State",
+    "VisualOdometry",
+]

@@ -4,10 +4,10 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from jaxtyping import Float, UInt8
+from jaxtyping import Float, Float64, Int64, UInt8
 from torch import Tensor
 
-from torchvo360.vo.keyframe import Keyframe
+from torchvo360.vo.frame import PyramidFrame
 
 MIN_RHO = 1e-3
 """Points farther than this inverse distance, in the odometry's unit, are at infinity for a cloud."""
@@ -15,20 +15,31 @@ MIN_RHO = 1e-3
 
 @dataclass(frozen=True)
 class PointCloud:
-    """Points in the world with their colours."""
+    """Points with their colours."""
 
     xyz: Float[Tensor, "N 3"]
     rgb: UInt8[Tensor, "N 3"]
 
+    def moved(self, S: Float64[Tensor, "4 4"]) -> "PointCloud":
+        """Return the points after a similarity."""
+        xyz = self.xyz.double() @ S[:3, :3].mT + S[:3, 3]
+        return PointCloud(xyz.float(), self.rgb)
 
-def to_cloud(key: Keyframe, max_relative_variance: float) -> PointCloud:
-    """Return a keyframe's trusted points in the world; points at infinity are left out."""
-    keep = key.trusted(max_relative_variance) & (key.points.rho > MIN_RHO)
-    p_key = key.ray[:, keep] / key.points.rho[keep]
-    T = key.T_world_key.to(p_key.device)
-    xyz = (T[:3, :3] @ p_key.double() + T[:3, 3:]).T.float()
-    colour = np.ascontiguousarray(key.frame.colour.reshape(-1, 3)[key.pixel[keep].cpu().numpy()])
-    return PointCloud(xyz.cpu(), torch.from_numpy(colour))
+
+def to_cloud(
+    ray: Float[Tensor, "3 N"], rho: Float[Tensor, "N"], pixel: Int64[Tensor, "N"], frame: PyramidFrame
+) -> PointCloud:
+    """Return points of a keyframe in its own camera, with their colours; points at infinity are left out.
+
+    Args:
+        ray: Unit rays.
+        rho: Inverse distances.
+        pixel: Flat pixels.
+        frame: The keyframe.
+    """
+    keep = rho > MIN_RHO
+    colour = np.ascontiguousarray(frame.colour.reshape(-1, 3)[pixel[keep].cpu().numpy()])
+    return PointCloud((ray[:, keep] / rho[keep]).T.float().cpu(), torch.from_numpy(colour))
 
 
 def join_clouds(clouds: list[PointCloud]) -> PointCloud:

@@ -6,7 +6,9 @@ from torchvo360.checks import InputError, check_finite_number
 from torchvo360.depth import EpipolarConfig, FilterConfig
 from torchvo360.vo.initialise import InitialiseConfig
 from torchvo360.vo.keyframe import MapConfig
+from torchvo360.vo.loops import LoopConfig
 from torchvo360.vo.track import TrackConfig
+from torchvo360.window import TraceConfig, WindowConfig
 
 
 @dataclass(kw_only=True)
@@ -30,6 +32,9 @@ class OdometryConfig:
     map: MapConfig = field(default_factory=MapConfig)
     epipolar: EpipolarConfig = field(default_factory=EpipolarConfig)
     filter: FilterConfig = field(default_factory=FilterConfig)
+    trace: TraceConfig = field(default_factory=TraceConfig)
+    window: WindowConfig = field(default_factory=WindowConfig)
+    loop: LoopConfig = field(default_factory=LoopConfig)
 
     def __post_init__(self) -> None:
         check_finite_number("blur_px", self.blur_px, above=-1e-9, at_most=5)

@@ -1,16 +1,17 @@
 """A frame made ready: grey image, pyramid and padded targets; what is the same for all frames is made once."""
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, UInt8
+from jaxtyping import Bool, Float, Float64, UInt8
 from torch import Tensor
 
-from torchvo360.cameras import Camera
+from torchvo360.cameras import Camera, Rig
 from torchvo360.image import gradient_magnitude, level_camera, pad_image, resample
-from torchvo360.residuals.direct import Target, look_up_usable
+from torchvo360.residuals.direct import Target, look_up_usable, make_target
 
 
 @dataclass(frozen=True)
@@ -25,6 +26,8 @@ class PyramidFrame:
     """For the map's points."""
     targets: list[Target]
     """Smoothed grey levels in [0, 1], the finest first, padded for look-up; batch 1, one channel."""
+    others: tuple[Target | None, ...] = ()
+    """The finest levels of a rig's further cameras; None where one gave no image."""
 
     def value(self, ray: Float[Tensor, "3 *points"]) -> Float[Tensor, "*points"]:
         """Return the finest level's intensities along rays; NaN where they are unseen, masked or clipped."""
@@ -37,7 +40,10 @@ class PyramidFrame:
 
 
 class FrameBuilder:
-    """Builds frames of one camera: level cameras, masks and ray grids are made once."""
+    """Builds frames of one camera, or of a rig: level cameras, masks and ray grids are made once.
+
+    The mask is the first camera's; what a rig's further cameras see of the rig is left to the outlier tests.
+    """
 
     def __init__(
         self,
@@ -47,7 +53,12 @@ class FrameBuilder:
         mask: Bool[Tensor, "H W"] | None,
         saturation: float,
         device: torch.device | str = "cpu",
+        rig: Rig | None = None,
     ) -> None:
+        self.rig = rig
+        self.T_other_first: tuple[Float64[Tensor, "4 4"], ...] = ()
+        if rig is not None:
+            self.T_other_first = tuple(rig.T_other_first(other) for other in range(1, len(rig)))
         self.cameras = [level_camera(camera, level) for level in range(levels)]
         self.blur_px, self.saturation, self.device = blur_px, saturation, torch.device(device)
         self.mask = torch.ones(camera.height, camera.width, dtype=torch.bool) if mask is None else mask
@@ -63,24 +74,50 @@ class FrameBuilder:
             levels.append(pad_image((share > 0.99).to(torch.float32)[None, None], camera, 1).contiguous())
         return levels
 
-    def build(self, colour: UInt8[np.ndarray, "H W 3"], index: int, t_ns: int) -> PyramidFrame:
-        """Return the frame of a colour image."""
+    def recalibrate(self, k: Float64[Tensor, "4"]) -> None:
+        """Take other intrinsics (fx, fy, cx, cy) of the finest level for all frames from now on."""
+        fx, fy, cx, cy = k.tolist()
+        finest = self.cameras[0].recalibrated(fx, fy, cx, cy)
+        self.cameras = [level_camera(finest, level) for level in range(len(self.cameras))]
+        self._rays = finest.ray_grid(device=self.device)
+
+    def recalibrated(self, frame: PyramidFrame) -> PyramidFrame:
+        """Return a frame built before with the present intrinsics."""
+        pairs = zip(frame.targets, self.cameras, strict=True)
+        return replace(frame, targets=[replace(target, camera=camera) for target, camera in pairs])
+
+    def build(
+        self,
+        colour: UInt8[np.ndarray, "H W 3"],
+        index: int,
+        t_ns: int,
+        others: Sequence[UInt8[np.ndarray, "H W 3"] | None] = (),
+    ) -> PyramidFrame:
+        """Return the frame of a colour image, and of those that a rig's further cameras took at the same time."""
         grey = cv2.cvtColor(colour, cv2.COLOR_RGB2GRAY)
-        level = torch.from_numpy(self._smoothed(grey)).to(self.device)
+        level = torch.from_numpy(self._smoothed(grey, self.cameras[0])).to(self.device)
         targets = []
         for camera, confidence in zip(self.cameras, self._confidence, strict=True):
             level = resample(level, camera)
             padded = pad_image(level[None, None], camera, 1).contiguous()
             targets.append(Target(camera, padded, confidence, self.saturation))
-        return PyramidFrame(index, t_ns, grey, colour, targets)
+        further = tuple(self._other(image, at) for at, image in enumerate(others, start=1))
+        return PyramidFrame(index, t_ns, grey, colour, targets, further)
 
-    def _smoothed(self, grey: UInt8[np.ndarray, "H W"]) -> Float[np.ndarray, "H W"]:
+    def _other(self, colour: UInt8[np.ndarray, "H W 3"] | None, at: int) -> Target | None:
+        if colour is None or self.rig is None:
+            return None
+        camera = self.rig.cameras[at]
+        image = torch.from_numpy(self._smoothed(cv2.cvtColor(colour, cv2.COLOR_RGB2GRAY), camera)).to(self.device)
+        return make_target(image[None, None], camera, saturation=self.saturation)
+
+    def _smoothed(self, grey: UInt8[np.ndarray, "H W"], camera: Camera) -> Float[np.ndarray, "H W"]:
         """Return the image in [0, 1], smoothed by OpenCV, which is fifteen times faster here than a convolution."""
         level = grey.astype(np.float32) * np.float32(1 / 255)
         if self.blur_px <= 0:
             return level
         margin = max(1, round(3 * self.blur_px))
-        wide = pad_image(torch.from_numpy(level), self.cameras[0], margin).numpy()
+        wide = pad_image(torch.from_numpy(level), camera, margin).numpy()
         smooth = cv2.GaussianBlur(wide, (2 * margin + 1, 2 * margin + 1), self.blur_px)
         return np.ascontiguousarray(smooth[margin:-margin, margin:-margin])
 

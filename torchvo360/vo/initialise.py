@@ -23,8 +23,9 @@ from torchvo360.residuals.weights import LossConfig
 from torchvo360.vo.corners import CornerTracks
 from torchvo360.vo.frame import FrameBuilder, PyramidFrame
 from torchvo360.vo.keyframe import Keyframe, MapConfig, make_keyframe
-from torchvo360.vo.refine import pattern_rays, refine_jointly
+from torchvo360.vo.refine import refine_jointly
 from torchvo360.vo.track import TrackConfig
+from torchvo360.window import pattern_rays
 
 CHECK_PARALLAX = 2.0
 """A start is checked once the parallax is this many times its own."""

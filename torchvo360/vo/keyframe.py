@@ -18,27 +18,35 @@ from torchvo360.vo.frame import FrameBuilder, PyramidFrame
 class MapConfig:
     """Settings of keyframes and their points."""
 
-    points: int = 6000
-    """Equal-area cells over the whole sphere, each with at most one point."""
+    points: int = 800
+    """Equal-area cells over the whole sphere, in each of which a new keyframe has at most one new point."""
+    start_points: int = 6000
+    """Cells of a first keyframe, each with at most one point, before its ranges are known."""
     min_gradient: float = 4 / 255
     """Least gradient of a point, intensity per pixel."""
-    keyframe_parallax_deg: float = 5.0
-    """Median parallax of the points at which a new keyframe is made; more often, and scale drifts."""
-    max_keyframe_gap: int = 40
+    max_difference: float = 15 / 255
+    """A point that looks more different in a keyframe is hidden there."""
+    keyframe_flow_deg: float = 4.6
+    """Mean angle by which translation moves the points at which a new keyframe is made."""
+    max_keyframe_gap: int = 24
     """Frames after which a keyframe is made in any case, once there is some parallax."""
+    max_keyframe_gain: float = 0.4
+    """Change of the log gain at which a new keyframe is made, once there is some parallax."""
     min_visible: float = 0.55
     """Share of agreeing gradient below which a new keyframe is made, if there is some parallax."""
     max_relative_variance: float = 0.05
     """Points with V / rho^2 below this track and enter the point cloud."""
 
     def __post_init__(self) -> None:
-        if self.points < 100:
-            raise InputError(f"points: expected at least 100, got {self.points}.")
+        for name in ("points", "start_points"):
+            if getattr(self, name) < 100:
+                raise InputError(f"{name}: expected at least 100, got {getattr(self, name)}.")
         if self.max_keyframe_gap < 1:
             raise InputError(f"max_keyframe_gap: expected at least 1, got {self.max_keyframe_gap}.")
         check_finite_number("min_visible", self.min_visible, above=-1e-9, at_most=1)
         check_finite_number("min_gradient", self.min_gradient, above=0)
-        check_finite_number("keyframe_parallax_deg", self.keyframe_parallax_deg, above=0)
+        for name in ("keyframe_flow_deg", "max_keyframe_gain", "max_difference"):
+            check_finite_number(name, getattr(self, name), above=0)
         check_finite_number("max_relative_variance", self.max_relative_variance, above=0)
 
 
@@ -46,6 +54,8 @@ class MapConfig:
 class KeyPoints:
     """A keyframe's points: all that tracking against it needs."""
 
+    index: int
+    """Of the frame."""
     T_world_key: Float64[Tensor, "4 4"]
     pixel: Int64[Tensor, "N"]
     """Flat pixels of the finest level, in increasing order."""
@@ -69,15 +79,15 @@ class KeyPoints:
         inv_length = Y.square().sum(0).clamp_min(1e-24).rsqrt()
         return Y * inv_length, self.points.rho * inv_length
 
-    def median_parallax(self, T_cam_key: Float64[Tensor, "4 4"]) -> float:
-        """Return the median angle by which the translation moves the points in use, radians; 0 without points."""
+    def mean_flow(self, T_cam_key: Float64[Tensor, "4 4"]) -> float:
+        """Return the mean angle by which the translation moves the points in use, radians; 0 without points."""
         used = self.points.score > 0
         if not bool(used.any()):
             return 0.0
         moved, _ = self.moved(T_cam_key)
         turned = T_cam_key[:3, :3].to(self.ray) @ self.ray
         cross = torch.linalg.cross(turned, moved, dim=0).square().sum(0).sqrt()
-        return float(torch.atan2(cross, (turned * moved).sum(0))[used].median())
+        return float(torch.atan2(cross, (turned * moved).sum(0))[used].mean())
 
 
 @dataclass
@@ -101,13 +111,13 @@ def make_keyframe(
     camera = builder.cameras[0]
     strength = builder.strength(frame)
     usable = builder.usable(frame)
-    cell = equal_area_cells(camera, config.points, device=strength.device).flatten()
+    cell = equal_area_cells(camera, config.start_points, device=strength.device).flatten()
     taken = torch.zeros(int(cell.max()) + 1, dtype=torch.bool, device=strength.device)
     if carried is not None:
         carried = carried.one_per_cell(cell[carried.pixel], usable.flatten() & (strength.flatten() > 0))
         taken[cell[carried.pixel]] = True
     pixel = select_pixels(
-        strength, usable & ~taken[cell].view_as(usable), camera, config.points, minimum=config.min_gradient
+        strength, usable & ~taken[cell].view_as(usable), camera, config.start_points, minimum=config.min_gradient
     )
     ray = builder.rays(pixel)
     points = InverseRange(torch.ones_like(ray[0]), torch.ones_like(ray[0]), torch.zeros_like(ray[0]))
@@ -117,4 +127,4 @@ def make_keyframe(
         ray = torch.cat([carried.ray, ray], 1)[:, order]
         points = InverseRange(*(torch.cat(pair)[order] for pair in zip(carried.points, points, strict=True)))
     values = [look_up_value(target, ray) for target in frame.targets]
-    return Keyframe(T_world_key, pixel, ray, strength.flatten()[pixel], values, points, frame)
+    return Keyframe(frame.index, T_world_key, pixel, ray, strength.flatten()[pixel], values, points, frame)

@@ -3,11 +3,12 @@
 from dataclasses import dataclass, replace
 
 import torch
-from jaxtyping import Float64
+from jaxtyping import Float, Float64
 from torch import Tensor
 
 from torchvo360 import lie
 from torchvo360.image import blur, pad_image
+from torchvo360.loop import describe_place, place_similarity
 from torchvo360.motion.rotation import align_rotation, rotation_grid, search_rotation
 from torchvo360.residuals.direct import Reference, Target
 from torchvo360.vo.frame import FrameBuilder, PyramidFrame
@@ -33,6 +34,8 @@ class Remembered:
 
     key: KeyPoints
     small: Target
+    descriptor: Float[Tensor, "D"]
+    """Of the place (`describe_place`)."""
 
 
 class Recovery:
@@ -50,8 +53,8 @@ class Recovery:
 
     def remember(self, key: Keyframe) -> None:
         """Keep a keyframe for relocalisation."""
-        points = KeyPoints(key.T_world_key, key.pixel, key.ray, key.slope, key.values, key.points)
-        self._remembered.append(Remembered(points, self._small(key.frame)))
+        points = KeyPoints(key.index, key.T_world_key, key.pixel, key.ray, key.slope, key.values, key.points)
+        self._remembered.append(Remembered(points, self._small(key.frame), self._described(key.frame)))
         self._turn = 0
 
     def __len__(self) -> int:
@@ -67,6 +70,11 @@ class Recovery:
         target = frame.targets[-1]
         image = blur(target.padded[..., 1:-1, 1:-1], target.camera, BLUR_PX)
         return replace(target, padded=pad_image(image, target.camera, 1).contiguous())
+
+    def _described(self, frame: PyramidFrame) -> Float[Tensor, "D"]:
+        target = frame.targets[-1]
+        known = None if target.confidence is None else target.confidence[0, 0, 1:-1, 1:-1] > 0.5
+        return describe_place(target.padded[0, 0, 1:-1, 1:-1], target.camera, known)
 
     def _points(self, target: Target) -> Reference:
         value = target.padded[..., 1:-1, 1:-1].reshape(1, 1, -1)
@@ -107,19 +115,28 @@ class Recovery:
                 found = tracked
         return found
 
-    def relocalise(self, frame: PyramidFrame, min_inliers: float) -> tuple[KeyPoints, Track] | None:
+    def relocalise(
+        self, frame: PyramidFrame, min_inliers: float, *, afresh: bool = False
+    ) -> tuple[KeyPoints, Track] | None:
         """Return an earlier keyframe in which a frame is found, from any orientation at about its place.
 
-        A few are tried, the newest first; the next call goes on with the older ones, and then begins again.
+        A few are tried, the most like ones first; the next call goes on with the less like, and then begins again.
 
         Args:
             frame: The lost frame.
             min_inliers: Share of agreeing gradient from which it counts as found.
+            afresh: Begin with the most like ones.
         """
-        small = self._small(frame)
+        self._turn = 0 if afresh else self._turn
         count = len(self._remembered)
+        if count == 0:
+            return None
+        small = self._small(frame)
+        places = torch.stack([place.descriptor for place in self._remembered])
+        like, _ = place_similarity(self._described(frame), places, yaw_invariant=small.camera.wraps)
+        order = like.argsort(descending=True, stable=True).tolist()
         for _ in range(min(TRIED_PER_FRAME, count)):
-            place = self._remembered[count - 1 - self._turn % count]
+            place = self._remembered[order[self._turn % count]]
             self._turn += 1
             rotations = search_rotation(self._points(place.small), small, self._grid)
             R = rotations.R_tgt_ref[:KEPT][rotations.agreement[:KEPT] >= MIN_AGREEMENT]

@@ -16,6 +16,7 @@ from torchvo360 import lie
 from torchvo360.residuals.direct import Reference, Target, by_rho, look_up, system_rows
 from torchvo360.residuals.weights import LossConfig, robust
 from torchvo360.solve import solve_ldl
+from torchvo360.solve.schur import back_substitute, reduce
 
 COUPLING = 1e-3
 """Weight of the prior that holds each rho to its start, relative to the points' mean curvature."""
@@ -28,29 +29,6 @@ class JointState(NamedTuple):
     affine: Float64[Tensor, "K 2"]
     rho: Float[Tensor, "N"]
     cost: float
-
-
-PATTERN = ((0, -2), (-1, -1), (1, -1), (-2, 0), (0, 0), (2, 0), (-1, 1), (0, 2))
-"""DSO's pattern, pixels to the right and down. Single pixels leave too little once each has its own inverse range."""
-
-
-def pattern_rays(ray: Float[Tensor, "3 N"], pixel_angle: float) -> Float[Tensor, "3 N P"]:
-    """Return the pattern's unit rays around each ray, laid in its tangent plane, so that it has one size everywhere.
-
-    Args:
-        ray: Unit rays.
-        pixel_angle: The angle of one pixel, radians.
-    """
-    x, _, z = ray
-    # Rightwards along the parallel; on the vertical axis any direction serves.
-    flat = torch.stack([z, torch.zeros_like(z), -x])
-    flat = torch.where((x.abs() + z.abs() > 1e-6), flat, flat.new_tensor([[1.0], [0.0], [0.0]]))
-    right = flat / torch.linalg.vector_norm(flat, dim=0)
-    # x right, y down, z forward is right-handed: forward x right = down.
-    down = torch.linalg.cross(ray, right, dim=0)
-    offset = ray.new_tensor(PATTERN) * pixel_angle
-    rays = ray[..., None] + right[..., None] * offset[:, 0] + down[..., None] * offset[:, 1]
-    return rays / torch.linalg.vector_norm(rays, dim=0)
 
 
 class _System(NamedTuple):
@@ -124,16 +102,15 @@ def refine_jointly(
         H_rho = (system.H_rho + coupling) * (1 + damping)
         g_rho = system.g_rho + coupling * (rho.double() - prior_rho)
         blocks = torch.block_diag(*system.H.unbind(0))
-        cross = system.by_point.reshape(K * 8, -1)
+        cross = system.by_point.reshape(K * 8, -1).mT
         # Weak priors on (a, b), and the last translation held along its own direction: that is the unit.
         extra = torch.zeros(K, 8, 8, dtype=torch.float64, device=T.device)
         extra[:, 6, 6] = extra[:, 7, 7] = 1e-3 * system.H[:, 7, 7]
         along = T[-1, :3, 3] / length
         extra[-1, :3, :3] += 1e3 * system.H.diagonal(dim1=1, dim2=2).amax() * torch.outer(along, along)
-        reduced = blocks + torch.block_diag(*extra.unbind(0)) + torch.diag(blocks.diagonal() * damping)
-        reduced = reduced - (cross / H_rho) @ cross.mT
-        delta, ok = solve_ldl(reduced, (cross / H_rho) @ g_rho - system.g.reshape(-1))
-        step = -(g_rho + cross.mT @ delta) / H_rho
+        H = blocks + torch.block_diag(*extra.unbind(0)) + torch.diag(blocks.diagonal() * damping)
+        delta, ok = solve_ldl(*reduce(H, system.g.reshape(-1), cross, H_rho, g_rho))
+        step = back_substitute(delta, cross, H_rho, g_rho)
         limit = 0.5 * rho.double()
         new_rho = (rho.double() + step.clamp(-limit, limit)).to(rho.dtype)
         each = delta.view(K, 8)

@@ -1,11 +1,10 @@
 """The odometry: frames in, a pose and a state for every one of them out.
 
-A step builds the frame's pyramid. Without a map the initialiser follows corners until it can make one; with a map the
-follower predicts, tracks, fuses and makes keyframes. A frame that is lost is looked for in the earlier keyframes, and
-after a while a new map is started and joined to the old one.
-
-With a depth network the first frame is a map already, in metres; the corners go on, and the start they make, which is
-more exact, takes its place in the network's unit.
+A step builds the frame's pyramid. Without a map the starter waits until it can make one; with a map the follower
+predicts, tracks, and makes keyframes, which the mapper adjusts together with their points. A frame that is lost is
+looked for in the earlier keyframes, and after a while a new map is started. Keyframes that leave the window are
+compared with the places seen before: loops correct the trajectory in the end, and join a new map to the old one at
+once.
 """
 
 import math
@@ -18,23 +17,24 @@ from jaxtyping import Bool, Float64
 from torch import Tensor, nn
 
 from torchvo360 import lie
-from torchvo360.cameras import Camera
+from torchvo360.cameras import Camera, Rig
 from torchvo360.checks import InputError, check_shape
 from torchvo360.data.frame import Frame
 from torchvo360.data.trajectory import Trajectory
-from torchvo360.vo.cloud import PointCloud, join_clouds, to_cloud
+from torchvo360.vo.atlas import Atlas
+from torchvo360.vo.begin import Begun, Starter
+from torchvo360.vo.cloud import PointCloud
 from torchvo360.vo.config import OdometryConfig
 from torchvo360.vo.follow import Follower, carried_keyframe
 from torchvo360.vo.frame import FrameBuilder, PyramidFrame
-from torchvo360.vo.initialise import Initialiser, Start
+from torchvo360.vo.keyframe import Keyframe
 from torchvo360.vo.learned import LearnedRanges
-from torchvo360.vo.pending import fill_in, track_pending
+from torchvo360.vo.loops import LoopCloser, LoopEdge
+from torchvo360.vo.mapper import Mapper
 from torchvo360.vo.recover import Recovery
 from torchvo360.vo.state import FrameEstimate, State
+from torchvo360.vo.stereo import StereoRanges, check_others, check_rig
 from torchvo360.vo.track import Track
-
-LEARNED = "learned_ranges"
-"""The reason of a frame whose map is made of a depth network's ranges."""
 
 
 @dataclass(frozen=True)
@@ -46,6 +46,14 @@ class OdometryResult:
     trajectory: Trajectory
     points: PointCloud
     keyframes: int
+    before_loops: Trajectory
+    """The trajectory without the loops' corrections; the same where none was closed."""
+    loops: list[LoopEdge]
+    """Verified loops, those that join maps included."""
+    maps: int
+    """Maps begun; more than one after losses."""
+    intrinsics: tuple[float, float, float, float] | None = None
+    """(fx, fy, cx, cy) as estimated, pixels; None where they were taken as given."""
 
 
 class VisualOdometry:
@@ -60,6 +68,7 @@ class VisualOdometry:
         depth: nn.Module | None = None,
         seed: int = 0,
         device: torch.device | str = "cpu",
+        rig: Rig | None = None,
     ) -> None:
         """Prepare for frames of one camera.
 
@@ -71,9 +80,12 @@ class VisualOdometry:
                 and its unit is the network's metre.
             seed: Of the random samples at the start: equal seeds give equal trajectories.
             device: Where the images are kept.
+            rig: The camera, first, and those fixed to it: the unit is then its metre, and every frame brings their
+                images as `others`, None for one that is missing.
 
         Raises:
             ShapeError: The mask is not of the camera's size.
+            InputError: The rig's first camera is another one, or all its centres are one.
         """
         self.config = config = OdometryConfig() if config is None else config
         if mask is not None:
@@ -82,21 +94,22 @@ class VisualOdometry:
         if camera.wraps and camera.width % 2:
             raise InputError(f"camera: expected an even width for a full panorama, got {camera.width}.")
         levels = 1 + max(0, round(math.log2(max(1.0, camera.width / config.coarsest_width))))
-        self._builder = FrameBuilder(camera, levels, config.blur_px, mask, config.saturation, device)
+        if rig is not None:
+            check_rig(rig, camera)
+            if depth is not None:
+                raise InputError("rig: expected none beside a depth network: either gives the unit.")
+        self._builder = FrameBuilder(camera, levels, config.blur_px, mask, config.saturation, device, rig)
         self._recovery = Recovery(self._builder, config.track, config.map.max_relative_variance)
-        self._learned: LearnedRanges | None = None
+        self._loops = LoopCloser(self._builder, config.loop)
+        learned = stereo = None
         if depth is not None:
-            self._learned = LearnedRanges(depth, self._builder, config.map, config.track.min_points)
-        self._generator = torch.Generator().manual_seed(seed)
-        self._estimates: list[FrameEstimate] = []
-        self._clouds: list[PointCloud] = []
-        self._maps = 0
+            learned = LearnedRanges(depth, self._builder, config.map, config.track.min_points)
+        if rig is not None:
+            stereo = StereoRanges(self._builder, config.map, config.trace, config.window, config.track.min_points)
+        self._metric = rig is not None
+        self._starter = Starter(self._builder, config, torch.Generator().manual_seed(seed), learned, stereo)
+        self._atlas = Atlas()
         self._follower: Follower | None = None
-        self._initialiser = self._new_initialiser()
-        self._T_world_ref = torch.eye(4, dtype=torch.float64)
-        self._unit = 1.0
-        self._unconfirmed: Initialiser | None = None
-        self._unsettled = False
         self._remembered_before = 0
         self._lost = 0
 
@@ -114,28 +127,36 @@ class VisualOdometry:
         if frame.image is None or frame.problem:
             estimate = self._predict(frame)
         else:
-            ready = self._builder.build(frame.image, frame.index, frame.t_ns)
-            follower = self._follower
-            estimate = self._initialise(ready) if follower is None else self._follow(follower, ready)
+            ready = self._builder.build(frame.image, frame.index, frame.t_ns, frame.others)
+            estimate = self._begin(ready) if self._follower is None else self._follow(self._follower, ready)
         estimate = replace(estimate, milliseconds=1e3 * (time.perf_counter() - began))
-        self._estimates.append(estimate)
+        self._atlas.estimates.append(estimate)
+        if self._follower is not None:
+            self._atlas.anchor(frame.index, self._follower.key.frame.index, lie.se3_inverse(self._follower.T_cam_key))
         return estimate
 
     def finish(self) -> OdometryResult:
         """Return all poses and points found so far; more steps may follow."""
-        clouds, keyframes = list(self._clouds), len(self._clouds)
+        atlas, loops = self._atlas, list(self._loops.edges)
         if self._follower is not None:
-            last = to_cloud(self._follower.key, self.config.map.max_relative_variance)
-            clouds += [*self._follower.clouds, last]
-            keyframes = len(clouds)
-        t_ns = torch.tensor([estimate.t_ns for estimate in self._estimates], dtype=torch.int64)
-        poses = [estimate.T_world_cam for estimate in self._estimates]
-        stacked = torch.stack(poses) if poses else torch.zeros(0, 4, 4, dtype=torch.float64)
-        return OdometryResult(list(self._estimates), Trajectory(t_ns, stacked), join_clouds(clouds), keyframes)
+            loops += self._loops.search(self._follower.mapper.references())
+        before = atlas.keyframes()
+        after = atlas.corrected(loops, self.config.loop.graph, metric=self._metric)
+        frames, earlier = atlas.final(after), atlas.final(before)
+        return OdometryResult(
+            frames=frames,
+            trajectory=_trajectory(frames),
+            points=atlas.points(after),
+            keyframes=len(after),
+            before_loops=_trajectory(earlier),
+            loops=loops,
+            maps=len(atlas.S_world_map),
+            intrinsics=self._builder.cameras[0].intrinsics if self.config.window.calibrate else None,
+        )
 
     def _check(self, frame: Frame) -> None:
-        if self._estimates:
-            last = self._estimates[-1]
+        if self._atlas.estimates:
+            last = self._atlas.estimates[-1]
             if frame.t_ns <= last.t_ns:
                 raise InputError(f"t_ns: expected more than {last.t_ns}, got {frame.t_ns}.")
             if frame.index <= last.index:
@@ -149,103 +170,71 @@ class VisualOdometry:
             raise InputError(f"image: expected a NumPy array of uint8, got {kind}.")
         if frame.image.shape != expected:
             raise InputError(f"image: expected shape {list(expected)}, got {list(frame.image.shape)}.")
+        check_others(frame, self._builder)
 
     # Without a map
 
-    def _new_initialiser(self) -> Initialiser:
-        config = self.config
-        return Initialiser(
-            self._builder,
-            config.initialise,
-            config.map,
-            config.track,
-            config.epipolar,
-            config.filter,
-            self._generator,
-        )
-
     @property
     def _waiting(self) -> State:
-        return State.INITIALISING if self._maps == 0 else State.LOST
+        return State.LOST if self._atlas.sessions else State.INITIALISING
 
-    def _initialise(self, frame: PyramidFrame) -> FrameEstimate:
+    def _begin(self, frame: PyramidFrame) -> FrameEstimate:
         found = self._relocalised(frame)
         if found is not None:
             return found
-        starter = self._initialiser
-        before = starter.pending[0] if starter.pending else None
-        if before is None:
-            starter.begin(frame)
-        elif (start := starter.add(frame)) is not None:
-            return self._begin_map(start, frame)
-        elif starter.pending[0] is not before:
-            # The corners ran out: go on from here, with the rotation reached so far.
-            R = starter.R_ref_before
-            self._T_world_ref = self._T_world_ref @ lie.se3(R.mT, R.new_zeros(3))
-        if starter.pending[0] is not before and (begun := self._begin_learned(frame)) is not None:
-            return begun
-        R_cam_ref = starter.rotations[frame.index]
-        T_world_cam = self._T_world_ref @ lie.se3(R_cam_ref.mT, R_cam_ref.new_zeros(3))
-        return _estimate(frame, T_world_cam, self._waiting, starter.reason, None)
+        begun = self._starter.add(frame)
+        if begun is not None:
+            return self._take_over(begun, frame)
+        return _estimate(frame, self._starter.pose(frame), self._waiting, self._starter.reason, None)
 
-    def _begin_learned(self, frame: PyramidFrame) -> FrameEstimate | None:
-        """Make the frame at which the corners begin a map of learned ranges; None without a network that knows them."""
-        key = None if self._learned is None else self._learned.keyframe(frame, self._T_world_ref)
-        if key is None:
-            return None
-        self._follower, self._unsettled = Follower(self._builder, self.config, self._recovery, key, placed=frame), True
-        self._lost, self._maps = 0, self._maps + 1
-        self._unit = float(key.points.rho[key.trusted(self.config.map.max_relative_variance)].median())
-        state = State.TRACKING if self._maps == 1 else State.RELOCALISED
-        return _estimate(frame, key.T_world_key, state, LEARNED, None)
-
-    def _settle(self, frame: PyramidFrame, T_world_cam: Float64[Tensor, "4 4"]) -> Start | None:
-        """Follow the corners beside a map of learned ranges; return the start that takes its place, once it can be."""
-        reference = self._initialiser.pending[0]
-        start = self._initialiser.add(frame)
-        if self._initialiser.pending[0] is not reference:
-            self._T_world_ref = T_world_cam
-        return start
-
-    def _begin_map(self, start: Start, frame: PyramidFrame, reason: str = "") -> FrameEstimate:
-        """Take over a start: fill in the poses of the frames that waited for it, and go on from the newest."""
-        # A new map after a loss takes the old one's unit by its median range, unless a network knows the metre.
-        unit = None if self._learned is None else self._learned.unit(start.key)
-        start = start.rescaled(self._unit if unit is None else unit)
-        start.key.T_world_key = self._T_world_ref
-        follower = Follower(self._builder, self.config, self._recovery, start.key)
-        known, found = track_pending(start, self._initialiser.pending, follower, self.config)
-        self._estimates = fill_in(self._estimates, start.key, known, self._initialiser.rotations)
-        # The initialiser goes on following its corners, until they have confirmed the start.
-        self._unconfirmed, self._initialiser = self._initialiser, self._new_initialiser()
-        self._remembered_before = len(self._recovery)
-        if self._unsettled and self._follower is not None:
-            self._clouds += self._follower.clouds
+    def _take_over(self, begun: Begun, frame: PyramidFrame) -> FrameEstimate:
+        """Go on with a map that has just begun, in place of a young one if there is one."""
+        atlas, first = self._atlas, not self._atlas.sessions
+        if begun.reason == "start_corrected":
+            self._recovery.forget(self._remembered_before)
+            self._loops.forget(set(atlas.sessions[-1].mapper.poses()))
+            atlas.drop_session()
+            atlas.begin(begun.mapper)
+        elif begun.reason == "start_settled":
+            earlier = [key for key in atlas.sessions[-1].mapper.poses() if key < begun.key]
+            atlas.sessions[-1].mapper.close()
+            atlas.begin(begun.mapper, map=atlas.sessions[-1].map, after=max(earlier, default=None))
         else:
-            self._maps += 1
-        self._follower, self._unsettled, self._lost = follower, False, 0
-        state = State.TRACKING if self._maps == 1 or reason else State.RELOCALISED
-        reason = reason or ("ok" if self._maps == 1 else "new_map")
-        return _estimate(frame, follower.T_world_cam, state, reason, found)
+            atlas.begin(begun.mapper)
+        atlas.fill_in(begun.key, begun.T_key_cam)
+        self._remembered_before = len(self._recovery)
+        for key in begun.mapper.references()[:-1]:
+            self._recovery.remember(key)
+        self._follow_on(begun.mapper, begun.newest, frame, begun.motion)
+        replaced = begun.reason in ("start_corrected", "start_settled")
+        state = State.TRACKING if first or replaced else State.RELOCALISED
+        reason = begun.reason if first or replaced else "new_map"
+        return _estimate(frame, atlas.in_world(begun.newest.T_world_key), state, reason, begun.found)
+
+    def _follow_on(
+        self, mapper: Mapper, key: Keyframe, frame: PyramidFrame, motion: Float64[Tensor, "4 4"] | None = None
+    ) -> None:
+        self._follower = Follower(self._builder, self.config, self._recovery, mapper, key)
+        if motion is not None:
+            self._follower.motion = motion
+        self._follower.place(frame)
+        self._lost = 0
 
     # With a map
 
     def _follow(self, follower: Follower, frame: PyramidFrame) -> FrameEstimate:
-        found, T_world_cam = follower.follow(frame)
+        found = follower.follow(frame)
         if found is None:
-            self._unconfirmed = None
             return self._lose(follower, frame)
-        if self._unsettled and (start := self._settle(frame, T_world_cam)) is not None:
-            return self._begin_map(start, frame, "start_settled")
-        if self._unconfirmed is not None:
-            T_cam_start = lie.se3_inverse(T_world_cam) @ self._T_world_ref
-            over, start = self._unconfirmed.check(frame, T_cam_start)
-            checked, self._unconfirmed = self._unconfirmed, None if over else self._unconfirmed
-            if start is not None:
-                self._initialiser = checked
-                self._recovery.forget(self._remembered_before)
-                return self._begin_map(start, frame, "start_corrected")
+        for index, T_cam_key in follower.bridged.items():
+            self._atlas.anchor(index, follower.key.frame.index, lie.se3_inverse(T_cam_key))
+        if (begun := self._starter.watch(frame, follower.T_map_cam)) is not None:
+            return self._take_over(begun, frame)
+        joined = [self._atlas.join(edge) for key in follower.left for edge in self._loops.add(key)]
+        T_world_cam = self._atlas.in_world(follower.T_map_cam)
         was_lost, self._lost = self._lost > 0, 0
+        if any(joined):
+            return _estimate(frame, T_world_cam, State.RELOCALISED, "maps_joined", found)
         if found.inliers < self.config.weak_inliers:
             return _estimate(frame, T_world_cam, State.WEAK, "low_agreement", found)
         state, reason = (State.RELOCALISED, "present_keyframe") if was_lost else (State.TRACKING, "ok")
@@ -254,56 +243,66 @@ class VisualOdometry:
     def _predict(self, frame: Frame) -> FrameEstimate:
         reason = f"bad_frame_{frame.problem or 'unreadable'}"
         if self._follower is not None:
-            self._follower.predict()
-            return _estimate(frame, self._follower.T_world_cam, State.WEAK, reason, None)
-        T_world_cam = self._estimates[-1].T_world_cam if self._estimates else self._T_world_ref
-        return _estimate(frame, T_world_cam, self._waiting, reason, None)
+            self._follower.predict(frame.index)
+            return _estimate(frame, self._atlas.in_world(self._follower.T_map_cam), State.WEAK, reason, None)
+        last = self._atlas.estimates[-1].T_world_cam if self._atlas.estimates else torch.eye(4, dtype=torch.float64)
+        return _estimate(frame, last, self._waiting, reason, None)
 
     # Losses
 
     def _lose(self, follower: Follower, frame: PyramidFrame) -> FrameEstimate:
-        if self._unsettled:
-            self._unsettled = False
-            if not follower.clouds:
-                # The network misjudged its only keyframe: the corners have to do without.
-                self._follower, self._maps = None, self._maps - 1
-                return self._initialise(frame)
-            self._initialiser = self._new_initialiser()
+        if self._starter.settling and not follower.mapper.settled:
+            # The network misjudged its only keyframe: the corners have to do without.
+            self._follower = None
+            self._atlas.drop_session()
+            return self._begin(frame)
+        self._starter.rest()
         self._lost += 1
         found = self._relocalised(frame)
         if found is not None:
             return found
         follower.stand()
+        T_world_cam = self._atlas.in_world(follower.T_map_cam)
         if self._lost < self.config.restart_after:
-            return _estimate(frame, follower.T_world_cam, State.LOST, "no_agreement", None)
+            return _estimate(frame, T_world_cam, State.LOST, "no_agreement", None)
+        unit = follower.median_rho()
         self._retire(follower)
-        self._T_world_ref, self._follower = follower.T_world_cam, None
-        self._initialiser = self._new_initialiser()
-        self._initialiser.begin(frame)
-        return self._begin_learned(frame) or _estimate(frame, self._T_world_ref, State.LOST, "restarting", None)
+        self._follower = None
+        self._starter.restart(T_world_cam, unit)
+        begun = self._starter.add(frame)
+        return self._take_over(begun, frame) if begun else _estimate(frame, T_world_cam, State.LOST, "restarting", None)
 
     def _relocalised(self, frame: PyramidFrame) -> FrameEstimate | None:
         """Look for a frame in the earlier keyframes, and go on from where it is found."""
-        if self._maps == 0:
+        if not self._atlas.sessions:
             return None
-        answer = self._recovery.relocalise(frame, self.config.weak_inliers)
+        answer = None if self._follower is None else self._follower.elsewhere
+        answer = answer or self._recovery.relocalise(frame, self.config.weak_inliers)
         if answer is None:
             return None
         old, found = answer
         if self._follower is not None:
             self._retire(self._follower)
         key = carried_keyframe(old, frame, found, self._builder, self.config)
-        self._follower, self._lost = Follower(self._builder, self.config, self._recovery, key, placed=frame), 0
-        self._initialiser, self._unsettled = self._new_initialiser(), False
-        return _estimate(frame, key.T_world_key, State.RELOCALISED, "earlier_keyframe", found)
+        mapper = Mapper.begun(key, self._builder, self.config, known=True)
+        self._atlas.begin(mapper, map=self._atlas.map_of(old.index), after=old.index)
+        self._follow_on(mapper, key, frame)
+        self._starter.rest()
+        return _estimate(frame, self._atlas.in_world(key.T_world_key), State.RELOCALISED, "earlier_keyframe", found)
 
     def _retire(self, follower: Follower) -> None:
-        """Keep what a follower leaves: its keyframe for relocalisation, its points, its unit."""
-        key = follower.key
-        self._recovery.remember(key)
-        self._clouds += [*follower.clouds, to_cloud(key, self.config.map.max_relative_variance)]
-        used = key.points.score > 0
-        self._unit = float(key.points.rho[used].median()) if bool(used.any()) else self._unit
+        """Keep what a follower leaves: its keyframes, for relocalisation and for loops, and their points."""
+        self._recovery.remember(follower.key)
+        for key in follower.mapper.references():
+            for edge in self._loops.add(key):
+                self._atlas.join(edge)
+        follower.mapper.close()
+
+
+def _trajectory(frames: list[FrameEstimate]) -> Trajectory:
+    t_ns = torch.tensor([estimate.t_ns for estimate in frames], dtype=torch.int64)
+    poses = [estimate.T_world_cam for estimate in frames]
+    return Trajectory(t_ns, torch.stack(poses) if poses else torch.zeros(0, 4, 4, dtype=torch.float64))
 
 
 def _estimate(

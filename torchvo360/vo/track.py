@@ -15,7 +15,7 @@ from torchvo360.residuals.direct import Reference, look_up
 from torchvo360.residuals.weights import LossConfig
 from torchvo360.solve import LMConfig
 from torchvo360.vo.frame import PyramidFrame
-from torchvo360.vo.keyframe import KeyPoints
+from torchvo360.vo.keyframe import Keyframe, KeyPoints
 
 
 @dataclass(kw_only=True)
@@ -125,6 +125,13 @@ def track(
         T, ab = solution.state[0][best : best + 1], solution.state[1][best : best + 1]
     T_best, ab_best = lie.se3_normalized(T[0]).to(T_cam_key.device), ab[0].to(affine.device)
     return measure(key, frame, T_best, ab_best, _thinned(usable, config.points_by_level[0]))
+
+
+def measure_keyframe(key: Keyframe, config: TrackConfig, max_relative_variance: float) -> Track:
+    """Return a keyframe as it tracks itself."""
+    index = key.trusted(max_relative_variance).nonzero()[:, 0]
+    eye, none = torch.eye(4, dtype=torch.float64), torch.zeros(2, dtype=torch.float64)
+    return measure(key, key.frame, eye, none, _thinned(index, config.points_by_level[0]))
 
 
 def measure(

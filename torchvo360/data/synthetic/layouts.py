@@ -12,7 +12,7 @@ from torchvo360.data.synthetic.surfaces import Lamp
 from torchvo360.data.synthetic.texture import HEIGHT, WIDTH
 from torchvo360.data.synthetic.world import Walkway, World
 
-WORLDS = ("room", "pillars", "courtyard")
+WORLDS = ("room", "pillars", "courtyard", "field")
 
 
 def make_world(name: str, *, seed: int = 0, panorama: str | Path | None = None, moving_objects: int = 0) -> World:
@@ -20,7 +20,8 @@ def make_world(name: str, *, seed: int = 0, panorama: str | Path | None = None, 
 
     Args:
         name: `room` (7.5 x 6 x 2.8 m, furnished), `pillars` (a hall of 14 x 11 x 4 m) or `courtyard` (18 x 14 m, walls
-            of 3.6 m and sky).
+            of 3.6 m and sky) or `field` (30 x 24 m, nothing but a few stems rises above the eye: sky over half of the
+            view, without clouds).
         seed: Where things stand and what they look like.
         panorama: An equirectangular image that the walls wear, or the sky where there is one; None for procedural
             looks.
@@ -32,7 +33,7 @@ def make_world(name: str, *, seed: int = 0, panorama: str | Path | None = None, 
     check_choice("world", name, WORLDS)
     generator = torch.Generator().manual_seed(seed)
     image = None if panorama is None else _read_panorama(Path(panorama))
-    makers = {"room": _room, "pillars": _pillars, "courtyard": _courtyard}
+    makers = {"room": _room, "pillars": _pillars, "courtyard": _courtyard, "field": _field}
     return makers[name](generator, moving_objects, image)
 
 
@@ -101,3 +102,18 @@ def _courtyard(generator: torch.Generator, movers: int, panorama: Tensor | None)
     lamps = (Lamp((60.0, 35.0, 80.0), 0.6, 1e4),)
     sky = b.chart("clouds")
     return b.build("courtyard", shell, lamps=lamps, ambient=0.62, sky=sky, movers=movers, panorama=panorama)
+
+
+def _field(generator: torch.Generator, movers: int, panorama: Tensor | None) -> World:
+    walkway = Walkway(centre=(-0.5, 0.3), radii=(1.9, 1.6), eye_height=1.6)
+    materials = ("brick", "stones", "paving", "haze", "collage", "mural")
+    b = Builder(generator, (30.0, 24.0, 1.75), walkway, materials, 70.0)
+    b.place(2, ("stones",), radius=(0.1, 0.15), height=(2.2, 2.8), rounds=1.0, gap=2.0)
+    b.place(24, ("collage", "mural", "brick", "stones"), radius=(0.2, 0.7), height=(0.3, 1.5), rounds=0.3, gap=0.5)
+    shell = [
+        (b.chart("brick"), (1.0, 0.8, 0.7)), (b.chart("stones"), b.tint(0.85)), (b.chart("brick"), (0.9, 0.9, 0.9)),
+        (b.chart("mural"), (0.85, 0.8, 0.75)), (b.chart("paving"), (1.0, 1.0, 1.0)),
+        (b.chart("paving"), (1.0, 0.98, 0.95)),
+    ]  # fmt: skip
+    lamps = (Lamp((60.0, 35.0, 80.0), 0.6, 1e4),)
+    return b.build("field", shell, lamps=lamps, ambient=0.62, sky=b.chart("haze"), movers=movers, panorama=panorama)

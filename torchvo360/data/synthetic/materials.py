@@ -12,7 +12,7 @@ Chart = Float[Tensor, "3 H W"]
 
 
 def draw(name: str, generator: torch.Generator) -> Chart:
-    """Draw a material by name: plaster, brick, planks, paving, mural, collage, stones, clouds; values in [0, 1]."""
+    """Draw a material by name: plaster, brick, planks, paving, mural, collage, stones, clouds or haze, in [0, 1]."""
     recipes: dict[str, Callable[[torch.Generator], Chart]] = {
         "plaster": _plaster,
         "brick": _brick,
@@ -22,6 +22,7 @@ def draw(name: str, generator: torch.Generator) -> Chart:
         "collage": _collage,
         "stones": _stones,
         "clouds": _clouds,
+        "haze": _haze,
     }
     return recipes[name](generator).clamp(0, 1)
 
@@ -137,3 +138,8 @@ def _clouds(generator: torch.Generator) -> Chart:
     cover = torch.sigmoid(1.6 * _noise(generator, 1.7))
     blue = torch.tensor([0.32, 0.5, 0.78])[:, None, None]
     return blue + cover * (0.92 - blue) + 0.015 * _noise(generator, 1.0)
+
+
+def _haze(generator: torch.Generator) -> Chart:
+    """Draw a sky without clouds: slow changes of 2 %, far below what a camera's noise hides."""
+    return torch.tensor([0.55, 0.68, 0.86])[:, None, None] + 0.02 * _noise(generator, 2.0)

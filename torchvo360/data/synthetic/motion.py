@@ -14,9 +14,17 @@ from torchvo360.checks import check_choice
 from torchvo360.data.synthetic.world import Walkway
 from torchvo360.lie import se3, so3_exp
 
-MOTIONS = ("walk", "loop", "rotation", "still")
+MOTIONS = ("walk", "loop", "turned_loop", "pause", "turn", "turn_first", "rotation", "still")
+STOPS = {"pause": 1.5, "turn": 3.0, "turn_first": 3.0}
+"""How long a walk stands still, seconds: at the middle, or, for turn_first, from its first frame."""
 SPEED = 0.95
 """Walking speed, metres a second."""
+RAMP_S = 0.5
+"""Time in which a walk comes to a stop, and gets going again."""
+TURN_DEG = 240.0
+"""Pure rotation of turn and turn_first: at most 96 degrees a second."""
+LOOP_TURN_DEG = 150.0
+"""How much further to the left the turned loop looks at its end."""
 STEPS_HZ = 1.8
 """Steps a second; the sway goes once from left to right every second step."""
 UPRIGHT = torch.tensor([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]], dtype=torch.float64)
@@ -46,7 +54,10 @@ def trajectory(
 
     Args:
         motion: `walk` (along the walkway at 0.95 m/s with bob, sway and wander), `loop` (once around the walkway, the
-            frame after the last would be the first), `rotation` (about a fixed point) or `still`.
+            frame after the last would be the first), `turned_loop` (the same path; the frame after the last would be
+            at the first one's place and look 150 deg further left), `pause` (a walk that stands still for 1.5 s at its
+            middle), `turn` (a walk that only turns, by 240 deg, for 3 s at its middle), `turn_first` (the same, for the
+            first 3 s), `rotation` (about a fixed point) or `still`.
         walkway: The free curve of the world.
         frames: Number of poses.
         fps: Frames a second.
@@ -72,14 +83,15 @@ def trajectory(
         pitch = 0.2 * (sway.wave(1, 1.3 * time) - sway.wave(1, still))
         roll = 0.12 * (sway.wave(2, 1.7 * time) - sway.wave(2, still))
     else:
-        if motion == "loop":
+        if motion in ("loop", "turned_loop"):
             # Every wave closes with the loop: a whole number of periods in `frames` frames.
             turn = index / frames
             wander, gait = math.tau * turn, math.tau * turn * max(1, round(frames / fps * STEPS_HZ / 2))
             distance = turn * _circumference(walkway)
         else:
-            wander, gait = 0.9 * time, math.tau * STEPS_HZ / 2 * time
-            distance = SPEED * time
+            going = time if motion == "walk" else _time_on_foot(time, *_stop(motion, frames / fps))
+            wander, gait = 0.9 * going, math.tau * STEPS_HZ / 2 * going
+            distance = SPEED * going
         angle = start + direction * _angle_at(walkway, start, direction, distance)
         position = _upright_at(walkway, angle)
         a, b = walkway.radii
@@ -91,9 +103,49 @@ def trajectory(
         yaw = heading + 0.12 * sway.wave(4, 2 * wander) + 0.02 * sway.wave(5, gait)
         pitch = 0.08 * sway.wave(6, wander) + 0.012 * sway.wave(7, 2 * gait)
         roll = 0.05 * sway.wave(8, wander) + 0.015 * sway.wave(9, gait)
+        if motion == "turned_loop":
+            yaw = yaw + math.radians(LOOP_TURN_DEG) * index / frames
+        elif motion in ("turn", "turn_first"):
+            begin, end = _stop(motion, frames / fps)
+            share = ((time - begin) / (end - begin)).clamp(0, 1)
+            nod = torch.sin(math.pi * share) ** 2  # and back
+            yaw = yaw + direction * math.radians(TURN_DEG) * _turned(share * (end - begin), end - begin)
+            pitch = pitch + 0.12 * nod * torch.sin(math.tau * share)
+            roll = roll + 0.06 * nod
     middle = frames // 2
     yaw = yaw + math.radians(yaw_jump_deg) * ((index - middle + 1) / 2).clamp(0, 1)
     return se3(_attitude(yaw, pitch, roll), position)
+
+
+def _stop(motion: str, duration_s: float) -> tuple[float, float]:
+    """Return when a walk stands still, and when it goes on, seconds."""
+    begin = 0.0 if motion == "turn_first" else (duration_s - STOPS[motion]) / 2
+    return begin, begin + STOPS[motion]
+
+
+def _time_on_foot(time: Float64[Tensor, "N"], begin: float, end: float) -> Float64[Tensor, "N"]:
+    """Return the time at walking speed that makes the way of a walk with a stop."""
+
+    def beside_stop(apart: Float64[Tensor, "N"]) -> Float64[Tensor, "N"]:
+        """Integrate the speed 3 x^2 - 2 x^3 of a ramp, and 1 beyond it."""
+        x = (apart / RAMP_S).clamp(0, 1)
+        return RAMP_S * (x**3 - x**4 / 2) + (apart - RAMP_S).clamp_min(0)
+
+    return beside_stop(time - end) - beside_stop(begin - time) + beside_stop(torch.full_like(time, begin))
+
+
+def _turned(time: Float64[Tensor, "N"], duration_s: float) -> Float64[Tensor, "N"]:
+    """Return the share of a turn done: its speed rises over a ramp, holds, and falls over a ramp."""
+
+    def risen(time: Float64[Tensor, "N"]) -> Float64[Tensor, "N"]:
+        x = (time / RAMP_S).clamp(0, 1)
+        return RAMP_S * (x**3 - x**4 / 2)
+
+    return (
+        risen(time)
+        + (time - RAMP_S).clamp(0, duration_s - 2 * RAMP_S)
+        + (RAMP_S / 2 - risen(duration_s - time)) * (time > duration_s - RAMP_S)
+    ) / (duration_s - RAMP_S)
 
 
 def _attitude(

@@ -6,19 +6,25 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from jaxtyping import Float, Float64
+from jaxtyping import Float, Float64, UInt8
 from torch import Tensor
 
-from torchvo360.cameras import Camera, Equirectangular, Pinhole
+from torchvo360.cameras import Camera, Equirectangular, Pinhole, Rig
 from torchvo360.checks import InputError, check_choice, check_finite_number
 from torchvo360.data.frame import Frame
+from torchvo360.data.synthetic.companion import MOST_SHARE, with_companion
 from torchvo360.data.synthetic.layouts import WORLDS, make_world
 from torchvo360.data.synthetic.motion import MOTIONS, trajectory
 from torchvo360.data.synthetic.rays import CameraRays
 from torchvo360.data.trajectory import Trajectory
 
 CAMERAS = ("equirectangular", "pinhole")
-EXPOSURES = ("constant", "steps", "drift")
+EXPOSURES = ("constant", "steps", "jumps", "drift")
+JUMP = 4.0
+"""Two stops."""
+STEREO_AXES = ("x", "y")
+MIN_BASELINE, MAX_BASELINE = 1e-3, 0.4
+"""Shortest and longest distance of two cameras, metres: the second too keeps clear of what stands beside the path."""
 MAX_SEED = 2**32 - 1
 """Largest seed: with the number of a frame it still makes a seed of 64 bits."""
 STEP_FRAMES = 20
@@ -30,7 +36,7 @@ class SyntheticConfig:
     """Settings of a synthetic sequence."""
 
     world: str = "room"
-    """What the camera is in: room, pillars or courtyard."""
+    """What the camera is in: room, pillars, courtyard or field."""
     frames: int = 150
     """Number of frames."""
     width: int = 512
@@ -46,15 +52,23 @@ class SyntheticConfig:
     fov_deg: float = 90.0
     """Horizontal field of view of the pinhole, degrees."""
     motion: str = "walk"
-    """How the camera moves: walk (0.95 m/s), loop (closed), rotation (about a fixed point) or still."""
+    """How the camera moves: walk (0.95 m/s), loop (closed), turned_loop (closed but for the yaw), pause, turn and
+    turn_first (walks that stand still for 1.5 s, or only turn for 3 s), rotation (about a fixed point) or still."""
     exposure: str = "constant"
-    """Brightness over time: constant, steps (by a factor of 1.5 to 2 every 20 frames) or drift (slow, 0.7 to 1.4)."""
+    """Brightness over time: constant, steps (by a factor of 1.5 to 2 every 20 frames), jumps (by two stops, between
+    0.5 and 2, every 20 frames) or drift (slow, 0.7 to 1.4)."""
     noise: float = 0.0
     """Standard deviation of the noise of each pixel and channel, in intensities of [0, 1]."""
     moving_objects: int = 0
     """Number of boxes that swing beside the path."""
+    moving_share: float = 0.0
+    """Share of the sphere, up to 0.4, that one object covers: it goes along with the camera and sways about it."""
     yaw_jump_deg: float = 0.0
     """Turn about the vertical inside two frames at the middle of the sequence, on top of the path, degrees."""
+    stereo_baseline: float = 0.0
+    """Distance of a second camera of the same kind from the first, metres; 0 for a single camera."""
+    stereo_axis: str = "x"
+    """Where the second camera is, in the first one's frame: x, to the right, or y, below."""
     panorama: str | None = None
     """Path of an equirectangular image that the walls wear, or the sky of the courtyard; None for procedural looks."""
 
@@ -63,6 +77,7 @@ class SyntheticConfig:
         check_choice("camera", self.camera, CAMERAS)
         check_choice("motion", self.motion, MOTIONS)
         check_choice("exposure", self.exposure, EXPOSURES)
+        check_choice("stereo_axis", self.stereo_axis, STEREO_AXES)
         for name, least in (("frames", 1), ("width", 16), ("height", 8), ("seed", 0), ("moving_objects", 0)):
             value = getattr(self, name)
             if not isinstance(value, int) or isinstance(value, bool) or value < least:
@@ -73,6 +88,13 @@ class SyntheticConfig:
             raise InputError(f"width: expected twice the height for a panorama, got {self.width} x {self.height}.")
         check_finite_number("fps", self.fps, above=0.0, at_most=1e6)
         check_finite_number("fov_deg", self.fov_deg, above=0.0, at_most=170.0)
+        if not (self.stereo_baseline == 0 or MIN_BASELINE <= self.stereo_baseline <= MAX_BASELINE):
+            expected = f"0 or a number from {MIN_BASELINE:g} to {MAX_BASELINE:g}"
+            raise InputError(f"stereo_baseline: expected {expected}, got {self.stereo_baseline!r}.")
+        if not 0 <= self.moving_share <= MOST_SHARE:
+            raise InputError(f"moving_share: expected a number from 0 to {MOST_SHARE}, got {self.moving_share!r}.")
+        if self.moving_share > 0 and self.stereo_baseline > 0:
+            raise InputError(f"moving_share: expected 0 with a second camera, got {self.moving_share!r}.")
         if not abs(self.yaw_jump_deg) <= 180:
             raise InputError(f"yaw_jump_deg: expected a finite number from -180 to 180, got {self.yaw_jump_deg!r}.")
         if not (math.isfinite(self.noise) and 0 <= self.noise <= 1):
@@ -80,7 +102,7 @@ class SyntheticConfig:
 
 
 class SyntheticSequence:
-    """An image sequence rendered on demand; `truth`, `pose` and `range` are exact.
+    """An image sequence rendered on demand; `truth`, `pose` and `range` are exact, and the first camera's.
 
     A frame is the world's colour times the frame's gain plus its offset plus noise, clipped to [0, 1], in 8 bits.
     """
@@ -97,6 +119,8 @@ class SyntheticSequence:
             config.world, seed=config.seed, panorama=config.panorama, moving_objects=config.moving_objects
         )
         self.camera: Camera = _camera(config)
+        self.rig: Rig | None = _rig(config, self.camera)
+        """The stereo pair, its body the first camera; None for a single camera."""
         self._rays = CameraRays.of(self.camera)
         self.name = f"synthetic_{config.world}"
         t_ns = (torch.arange(config.frames, dtype=torch.float64) * (1e9 / config.fps)).round().long()
@@ -109,6 +133,8 @@ class SyntheticSequence:
             yaw_jump_deg=config.yaw_jump_deg,
         )
         self.truth = Trajectory(t_ns, poses)
+        if config.moving_share > 0:
+            self.world = with_companion(self.world, poses, config.fps, config.moving_share, config.seed)
         self.gains, self.offsets = _exposure(config)
 
     @property
@@ -129,24 +155,40 @@ class SyntheticSequence:
 
     def render(self, index: int) -> tuple[Float[Tensor, "3 H W"], Float[Tensor, "H W"]]:
         """Return a frame's colours before exposure and noise, in [0, 1], and its exact range, inf for the sky."""
-        return self.world.render(self._rays, self.pose(index), t=index / self.config.fps)
+        return self._render(index, self.pose(index))
+
+    def _render(
+        self, index: int, T_world_cam: Float64[Tensor, "4 4"]
+    ) -> tuple[Float[Tensor, "3 H W"], Float[Tensor, "H W"]]:
+        return self.world.render(self._rays, T_world_cam, t=index / self.config.fps)
 
     def range(self, index: int) -> Float[Tensor, "H W"]:
         """Return the exact range of every pixel's centre in the camera's measure, metres; inf for the sky."""
         return self.render(index)[1]
 
     def frame(self, index: int) -> Frame:
-        """Return a frame.
+        """Return a frame; of a stereo pair with the second camera's image, under the same exposure.
 
         Raises:
             InputError: The index is not one of the sequence.
         """
-        image = self.render(index)[0] * float(self.gains[index]) + float(self.offsets[index])
+        T_world_first = self.pose(index)
+        generator = torch.Generator().manual_seed(self.config.seed * 1_000_003 + index)
+        image = self._expose(index, self._render(index, T_world_first)[0], generator)
+        others = () if self.rig is None else self.rig.T_body_cam[1:]
+        looks = (self._render(index, T_world_first @ T_first_other)[0] for T_first_other in others)
+        further = tuple(self._expose(index, colour, generator) for colour in looks)
+        return Frame(index, int(self.truth.t_ns[index]), image, others=further)
+
+    def _expose(
+        self, index: int, colour: Float[Tensor, "3 H W"], generator: torch.Generator
+    ) -> UInt8[np.ndarray, "H W 3"]:
+        """Return the image that a frame's exposure makes of colours, with noise drawn next from the generator."""
+        image = colour * float(self.gains[index]) + float(self.offsets[index])
         if self.config.noise > 0:
-            generator = torch.Generator().manual_seed(self.config.seed * 1_000_003 + index)
             image += self.config.noise * torch.randn(image.shape, generator=generator)
         pixels = image.clamp_(0, 1).mul_(255).round_().to(torch.uint8).permute(1, 2, 0)
-        return Frame(index, int(self.truth.t_ns[index]), np.ascontiguousarray(pixels.numpy()))
+        return np.ascontiguousarray(pixels.numpy())
 
     def _checked(self, index: int) -> int:
         if not 0 <= index < len(self):
@@ -161,8 +203,16 @@ def _camera(config: SyntheticConfig) -> Camera:
     return Pinhole(config.width, config.height, focal, focal, config.width / 2, config.height / 2)
 
 
+def _rig(config: SyntheticConfig, camera: Camera) -> Rig | None:
+    if config.stereo_baseline == 0:
+        return None
+    T_body_cam = torch.eye(4, dtype=torch.float64).repeat(2, 1, 1)
+    T_body_cam[1, STEREO_AXES.index(config.stereo_axis), 3] = config.stereo_baseline
+    return Rig((camera, camera), T_body_cam)
+
+
 def _exposure(config: SyntheticConfig) -> tuple[Float64[Tensor, "N"], Float64[Tensor, "N"]]:
-    """Return the gain and the offset of every frame; those of the first are 1 and 0."""
+    """Return the gain and the offset of every frame; those of the first are 1 and 0, but for jumps."""
     index = torch.arange(config.frames)
     gains, offsets = torch.ones(config.frames, dtype=torch.float64), torch.zeros(config.frames, dtype=torch.float64)
     generator = torch.Generator().manual_seed(config.seed + 1)
@@ -178,6 +228,8 @@ def _exposure(config: SyntheticConfig) -> tuple[Float64[Tensor, "N"], Float64[Te
         offset = 0.06 * (draw[:, 1] - 0.5)
         offset[0] = 0
         gains, offsets = level[index // STEP_FRAMES], offset[index // STEP_FRAMES]
+    elif config.exposure == "jumps":
+        gains = torch.where(index // STEP_FRAMES % 2 == 1, JUMP**0.5, JUMP**-0.5).double()
     elif config.exposure == "drift":
         swing = torch.sin(index.double() / config.fps * 1.3)
         gains, offsets = torch.exp(swing * math.log(1.4)), -0.02 * swing

@@ -30,6 +30,26 @@ class Mover:
     """Displacement at the far end, metres."""
     period_s: float
 
+    def offset(self, t: float) -> Float[Tensor, "3"]:
+        """Return how far it is from its place at a time, metres."""
+        return (1 - math.cos(math.tau * t / self.period_s)) / 2 * torch.tensor(self.swing)
+
+
+@dataclass(frozen=True)
+class Traveller:
+    """A solid that goes along a path, in straight lines between its places, and stays at the last one."""
+
+    solid: int
+    path: Float[Tensor, "N 3"]
+    """Displacement at each of the times k / fps, metres."""
+    fps: float
+
+    def offset(self, t: float) -> Float[Tensor, "3"]:
+        """Return how far it is from its place at a time, metres."""
+        at = min(max(t * self.fps, 0.0), len(self.path) - 1.0)
+        k = min(int(at), len(self.path) - 2) if len(self.path) > 1 else 0
+        return torch.lerp(self.path[k], self.path[min(k + 1, len(self.path) - 1)], at - k)
+
 
 @dataclass(frozen=True)
 class Walkway:
@@ -48,7 +68,7 @@ class World:
     solids: Solids
     surfaces: Surfaces
     walkway: Walkway
-    movers: tuple[Mover, ...] = ()
+    movers: tuple[Mover | Traveller, ...] = ()
 
     def render(
         self, camera: Camera | CameraRays, T_world_cam: Float[Tensor, "*batch 4 4"], t: float = 0.0
@@ -92,8 +112,7 @@ class World:
             return self.solids
         offset = torch.zeros_like(self.solids.centre)
         for mover in self.movers:
-            share = (1 - math.cos(math.tau * t / mover.period_s)) / 2
-            offset[mover.solid] = share * torch.tensor(mover.swing)
+            offset[mover.solid] = mover.offset(t)
         return self.solids.moved(offset)
 
     def _render(

@@ -1,0 +1,160 @@
+"""The record of a run: what was said of every frame, and what it stands on, so that later corrections reach it.
+
+Every frame placed on a map is kept relative to one of its keyframes. A keyframe goes on moving while it is in the
+window; at the end each frame's pose is its keyframe's final pose and the frame's own place in it. A map has a unit of
+its own: its place in the world is a similarity, which is found when one of its keyframes shows a place of another map.
+"""
+
+import math
+from dataclasses import dataclass, field, replace
+from itertools import pairwise
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Float64
+from torch import Tensor
+
+from torchvo360 import lie
+from torchvo360.loop import PoseGraph, PoseGraphConfig, carry_poses, odometry_information, optimise_pose_graph
+from torchvo360.vo.cloud import PointCloud, join_clouds
+from torchvo360.vo.loops import LoopEdge
+from torchvo360.vo.mapper import Mapper
+from torchvo360.vo.state import FrameEstimate
+
+UNMEASURED = {"residual": math.nan, "inliers": math.nan, "a": math.nan, "b": math.nan}
+METRIC_SCALE_SIGMA = 1e-4
+"""Drift of scale from keyframe to keyframe where the unit is known."""
+
+
+class Session(NamedTuple):
+    """Keyframes that followed one another in one window."""
+
+    map: int
+    after: int | None
+    """The keyframe of an earlier session from which this one went on."""
+    mapper: Mapper
+
+
+@dataclass
+class Atlas:
+    """Frames, and the keyframes of all maps."""
+
+    estimates: list[FrameEstimate] = field(default_factory=list)
+    """As they were given out, one a frame."""
+    anchors: dict[int, tuple[int, Float64[Tensor, "4 4"]]] = field(default_factory=dict)
+    """By frame index: its keyframe, and T_key_cam."""
+    sessions: list[Session] = field(default_factory=list)
+    """The newest last."""
+    S_world_map: list[Float64[Tensor, "4 4"]] = field(default_factory=list)
+
+    def begin(self, mapper: Mapper, *, map: int | None = None, after: int | None = None) -> None:
+        """Begin a session: on an earlier map, after one of its keyframes, or on a new one."""
+        if map is None:
+            map = len(self.S_world_map)
+            self.S_world_map.append(torch.eye(4, dtype=torch.float64))
+        self.sessions.append(Session(map, after, mapper))
+
+    def drop_session(self) -> None:
+        """Take back the newest session, whose map turned out wrong."""
+        gone = self.sessions.pop()
+        if all(session.map != gone.map for session in self.sessions):
+            self.S_world_map.pop()
+
+    def map_of(self, key: int) -> int:
+        """Return the map that a keyframe belongs to."""
+        return next(session.map for session in reversed(self.sessions) if session.mapper.has(key))
+
+    def in_world(self, T_map_cam: Float64[Tensor, "4 4"]) -> Float64[Tensor, "4 4"]:
+        """Return the world pose of a camera on the present map."""
+        S = self.S_world_map[self.sessions[-1].map]
+        return carry_poses(S[None], torch.zeros(1, dtype=torch.int64), lie.se3_normalized(T_map_cam)[None])[0]
+
+    def anchor(self, index: int, key: int, T_key_cam: Float64[Tensor, "4 4"]) -> None:
+        """Note where a frame stands."""
+        self.anchors[index] = (key, lie.se3_normalized(T_key_cam))
+
+    def fill_in(self, key: int, T_key_cam: dict[int, Float64[Tensor, "4 4"]]) -> None:
+        """Place frames that were given out before on a new map: what was measured against another says nothing now."""
+        for at, estimate in enumerate(self.estimates):
+            if estimate.index in T_key_cam:
+                self.anchor(estimate.index, key, T_key_cam[estimate.index])
+                self.estimates[at] = replace(estimate, **UNMEASURED)
+
+    def join(self, edge: LoopEdge) -> bool:
+        """Place the newer of the two maps that a loop connects; False where it connects a map with itself."""
+        map_i, map_j = self.map_of(edge.i), self.map_of(edge.j)
+        if map_i == map_j:
+            return False
+        poses = self._in_maps()
+        # X_world = S_world_i X_i, and X_i = S_j_i^-1 X_j: what j's keyframe sees is where i's says.
+        S_i_j = lie.sim3_inverse(edge.S_j_i)
+        if map_j > map_i:
+            placed = self.S_world_map[map_i] @ poses[edge.i] @ S_i_j @ lie.se3_inverse(poses[edge.j])
+            self.S_world_map[map_j] = placed
+        else:
+            placed = self.S_world_map[map_j] @ poses[edge.j] @ edge.S_j_i @ lie.se3_inverse(poses[edge.i])
+            self.S_world_map[map_i] = placed
+        return True
+
+    def keyframes(self) -> dict[int, Float64[Tensor, "4 4"]]:
+        """Return S_world_key of all keyframes, by frame index."""
+        return {
+            key: self.S_world_map[session.map] @ T
+            for session in self.sessions
+            for key, T in session.mapper.poses().items()
+        }
+
+    def _in_maps(self) -> dict[int, Float64[Tensor, "4 4"]]:
+        return {key: T for session in self.sessions for key, T in session.mapper.poses().items()}
+
+    def corrected(
+        self, loops: list[LoopEdge], config: PoseGraphConfig, *, metric: bool = False
+    ) -> dict[int, Float64[Tensor, "4 4"]]:
+        """Return S_world_key of all keyframes after the loops have been closed."""
+        nodes = self.keyframes()
+        place = {key: at for at, key in enumerate(nodes)}
+        loops = [edge for edge in loops if edge.i in place and edge.j in place]
+        if not loops:
+            return nodes
+        poses = self._in_maps()
+        chain: list[tuple[int, int]] = []
+        for session in self.sessions:
+            keys = sorted(session.mapper.poses())
+            if session.after is not None and keys:
+                chain.append((session.after, keys[0]))
+            chain += list(pairwise(keys))
+        S_chain = torch.stack([lie.se3_inverse(poses[j]) @ poses[i] for i, j in chain])
+        sigma = {"scale_sigma": METRIC_SCALE_SIGMA} if metric else {}
+        graph = PoseGraph(
+            S_world_key=torch.stack(list(nodes.values())),
+            i=torch.tensor([place[i] for i, _ in chain] + [place[edge.i] for edge in loops]),
+            j=torch.tensor([place[j] for _, j in chain] + [place[edge.j] for edge in loops]),
+            S_j_i=torch.cat([S_chain, torch.stack([edge.S_j_i for edge in loops])]),
+            information=torch.cat(
+                [odometry_information(S_chain, **sigma), torch.stack([edge.information for edge in loops])]
+            ),
+            is_loop=torch.tensor([False] * len(chain) + [True] * len(loops)),
+            held=torch.arange(len(nodes)) == 0,
+        )
+        result = optimise_pose_graph(graph, config)
+        return dict(zip(nodes, result.S_world_key, strict=True))
+
+    def final(self, S_world_key: dict[int, Float64[Tensor, "4 4"]]) -> list[FrameEstimate]:
+        """Return all estimates with the poses that follow from their keyframes'."""
+        place = {key: at for at, key in enumerate(S_world_key)}
+        known = [at for at, e in enumerate(self.estimates) if self.anchors.get(e.index, (-1,))[0] in place]
+        out = list(self.estimates)
+        if not known:
+            return out
+        anchors = [self.anchors[self.estimates[at].index] for at in known]
+        keys = torch.tensor([place[key] for key, _ in anchors])
+        poses = carry_poses(torch.stack(list(S_world_key.values())), keys, torch.stack([T for _, T in anchors]))
+        for at, T_world_cam in zip(known, poses, strict=True):
+            # Of its own: a view would keep all poses alive with any one of them.
+            out[at] = replace(out[at], T_world_cam=T_world_cam.clone())
+        return out
+
+    def points(self, S_world_key: dict[int, Float64[Tensor, "4 4"]]) -> PointCloud:
+        """Return the points of all maps in the world."""
+        clouds = {key: cloud for session in self.sessions for key, cloud in session.mapper.all_clouds().items()}
+        return join_clouds([cloud.moved(S_world_key[key]) for key, cloud in clouds.items()])

@@ -1,0 +1,23 @@
+"""Photometric bundle adjustment of a window of keyframes."""
+
+from torchvo360.window.config import WindowConfig
+from torchvo360.window.pattern import CENTRE, PATTERN, pattern_rays
+from torchvo360.window.points import WindowPoints, make_points
+from torchvo360.window.state import WindowFrame
+from torchvo360.window.trace import TraceConfig, View, trace
+from torchvo360.window.window import Adjustment, Window
+
+__all__ = [
+    "CENTRE",
+    "PATTERN",
+    "Adjustment",
+    "TraceConfig",
+    "View",
+    "Window",
+    "WindowConfig",
+    "WindowFrame",
+    "WindowPoints",
+    "make_points",
+    "pattern_rays",
+    "trace",
+]

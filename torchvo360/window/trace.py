@@ -1,0 +1,157 @@
+"""Tracing: from no idea of a new point's range to a start for its optimisation, all points at once.
+
+The points of a new keyframe are traced backwards into the last ones, which makes them usable at once. Along each
+point's great circle (equations.md, section 5) every pixel of arc is compared by five samples spaced along the curve,
+which takes one look-up a pixel; the best few places are then compared through the whole pattern, in all views.
+"""
+
+import math
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Bool, Float, Float64
+from torch import Tensor
+
+from torchvo360.checks import InputError, check_finite_number
+from torchvo360.depth.epipolar import HALF_PATTERN, GreatCircles, great_circles, reference_samples
+from torchvo360.residuals.direct import Target, look_up_usable
+from torchvo360.window.points import WindowPoints
+
+FINE_STEPS = (-1.0, -0.5, 0.0, 0.5, 1.0)
+"""Where the pattern is compared around each candidate, pixels of arc."""
+APART = 3
+"""Candidates are at least this many pixels apart."""
+LEAST_BEND = 0.1 / 255**2
+"""Second difference of the cost over half pixels below which nothing says where the match lies: no texture."""
+NEVER = 1e6
+
+
+@dataclass(kw_only=True)
+class TraceConfig:
+    """Settings of tracing new points."""
+
+    reach_px: int = 128
+    """Pixels of arc from infinity that are searched, at a width of 1024; it grows and shrinks with the image."""
+    candidates: int = 4
+    """Places along the curve that are compared through the whole pattern."""
+    views: int = 2
+    """Earlier keyframes that a new point is traced into."""
+    max_difference: float = 20 / 255
+    """Differences of intensity count at most this much."""
+    max_energy: float = 200 / 255**2
+    """Mean square difference above which nothing was found."""
+    min_distinction: float = 1.5
+    """The second best place must be this many times worse."""
+
+    def __post_init__(self) -> None:
+        if self.reach_px < 8 or self.candidates < 1 or self.views < 1:
+            raise InputError(
+                "reach_px, candidates, views: expected at least 8, 1 and 1, got "
+                f"{self.reach_px}, {self.candidates} and {self.views}."
+            )
+        for name in ("max_difference", "max_energy"):
+            check_finite_number(name, getattr(self, name), above=0)
+        check_finite_number("min_distinction", self.min_distinction, above=1 - 1e-9)
+
+
+class View(NamedTuple):
+    """Another image of what the host sees."""
+
+    target: Target
+    T_tgt_host: Float64[Tensor, "4 4"]
+    affine: Float64[Tensor, "2"]
+    """(a, b) of the view against the host: I_view = e^a I_host + b."""
+
+
+class Traced(NamedTuple):
+    """What tracing found for each point."""
+
+    rho: Float[Tensor, "N"]
+    found: Bool[Tensor, "N"]
+
+
+def trace(points: WindowPoints, host: Target, views: list[View], config: TraceConfig) -> Traced:
+    """Find the inverse distances of points by their great circles.
+
+    Args:
+        points: New points of one host.
+        host: The host's image.
+        views: Images to search in; the first one's great circles are walked along.
+        config: Settings.
+    """
+    first = views[0]
+    step = first.target.camera.pixel_angle
+    reach = max(8, round(config.reach_px * first.target.camera.width / 1024)) if host.camera.wraps else config.reach_px
+    centre = points.ray.sum(2)
+    centre = centre / centre.square().sum(0).sqrt()
+    circles = great_circles(centre, first.T_tgt_host.to(centre))
+    candidates, allowed = _walk(centre, circles, host, first, reach, step, config)
+    place = candidates[..., None] + candidates.new_tensor(FINE_STEPS)
+    theta = place * step
+    N, C, F = theta.shape
+    rho = circles.rho(theta.flatten(1))
+    inside = (theta > -0.5 * step) & (theta < 0.9 * circles.phi[:, None, None]) & allowed[..., None]
+    cost = torch.where(inside, _pattern_cost(points, rho, views, config).view(N, C, F), NEVER)
+    best, at = cost.min(2)
+    # A minimum on the edge of its neighbourhood belongs to no valley.
+    inner = at.clamp(1, F - 2)
+    left, right = (cost.gather(2, inner[..., None] + side)[..., 0] for side in (-1, 1))
+    middle = cost.gather(2, inner[..., None])[..., 0]
+    bend = left + right - 2 * middle
+    shift = torch.where((bend > 1e-12) & (left < NEVER) & (right < NEVER), (left - right) / (2 * bend), 0.0)
+    spacing = FINE_STEPS[1] - FINE_STEPS[0]
+    refined = place.gather(2, inner[..., None])[..., 0] + shift.clamp(-1, 1) * spacing
+    lowest, which = best.min(1)
+    chosen = refined.gather(1, which[:, None])[:, 0]
+    apart = (candidates - candidates.gather(1, which[:, None])).abs() >= APART
+    second = torch.where(apart, best, NEVER).min(1).values
+    distinct = second > config.min_distinction * lowest.clamp_min(1 / 255**2)
+    out = circles.rho((chosen * step).clamp_min(0.0)[:, None])[:, 0].clamp_min(0.0)
+    curved = bend.gather(1, which[:, None])[:, 0] > LEAST_BEND
+    found = (lowest < config.max_energy) & distinct & curved & (chosen > 0.25) & torch.isfinite(out)
+    return Traced(torch.where(found, out, 1.0), found)
+
+
+def _walk(
+    centre: Tensor, circles: GreatCircles, host: Target, view: View, reach: int, step: float, config: TraceConfig
+) -> tuple[Float[Tensor, "N C"], Bool[Tensor, "N C"]]:
+    """Return the best places along the curves by five samples each, in pixels of arc from infinity."""
+    T = view.T_tgt_host.to(centre)
+    samples = reference_samples(host, centre, circles, T, step)
+    samples = samples * math.exp(float(view.affine[0])) + float(view.affine[1])
+    offsets = torch.arange(-HALF_PATTERN, reach + HALF_PATTERN + 1, dtype=centre.dtype, device=centre.device)
+    theta = offsets * step
+    direction = circles.start[..., None] * theta.cos() + circles.towards[..., None] * theta.sin()
+    seen = look_up_usable(view.target, direction).unfold(1, 2 * HALF_PATTERN + 1, 1)
+    difference = (seen - samples[:, None]).abs().clamp_max(config.max_difference)
+    ssd = difference.square().sum(-1).nan_to_num(nan=NEVER)
+    inside = theta[HALF_PATTERN:-HALF_PATTERN] < 0.9 * circles.phi[:, None]
+    ssd = torch.where(inside, ssd, NEVER)
+    valley = torch.nn.functional.pad(ssd, (1, 1), value=NEVER)
+    # Of a level stretch only the beginning: it is one place, not several.
+    lowest = (ssd < valley[:, :-2]) & (ssd <= valley[:, 2:])
+    count = min(config.candidates, ssd.shape[1])
+    value, place = torch.where(lowest, ssd, NEVER).topk(count, dim=1, largest=False)
+    return place.to(centre.dtype), value < NEVER
+
+
+def _pattern_cost(
+    points: WindowPoints, rho: Float[Tensor, "N M"], views: list[View], config: TraceConfig
+) -> Float[Tensor, "N M"]:
+    """Return the mean square difference of the whole pattern at some inverse distances, over all views that see it."""
+    weight = points.weight
+    total, seen = torch.zeros_like(rho), torch.zeros_like(rho)
+    for view in views:
+        T = view.T_tgt_host.to(rho)
+        turned = torch.einsum("ij,jnp->inp", T[:3, :3], points.ray)
+        ray = turned[:, :, None] + rho[..., None] * T[:3, 3, None, None, None]
+        value = look_up_usable(view.target, ray)
+        expected = (points.value * math.exp(float(view.affine[0])) + float(view.affine[1]))[:, None]
+        ok = torch.isfinite(value)
+        w = weight[:, None] * ok
+        square = (value.nan_to_num(nan=0.0) - expected).abs().clamp_max(config.max_difference).square()
+        total += (square * w).sum(-1)
+        seen += w.sum(-1)
+    most = len(views) * weight.sum(1, keepdim=True)
+    return torch.where(seen > 0.5 * most.clamp_min(1e-6), total / seen.clamp_min(1e-6), NEVER)

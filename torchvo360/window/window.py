@@ -1,0 +1,273 @@
+"""The window: keyframes and points that are adjusted together, and the prior that stands for all that came before."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Float64
+from torch import Tensor
+
+from torchvo360.checks import InputError
+from torchvo360.residuals.direct import Target
+from torchvo360.solve import solve_ldl
+from torchvo360.solve.schur import back_substitute, reduce
+from torchvo360.window.calibration import INTRINSICS, at_intrinsics, intrinsics_of, prior_weights, unit_rays
+from torchvo360.window.config import MIN_KEYFRAMES, WindowConfig
+from torchvo360.window.energy import linearize_window
+from torchvo360.window.points import WindowPoints
+from torchvo360.window.prior import Prior, difference, eliminate_frame
+from torchvo360.window.settle import settle_points
+from torchvo360.window.state import PER_FRAME, POSE, Estimate, WindowFrame, estimate_of, first_poses
+from torchvo360.window.stereo import Other, fit_brightness
+from torchvo360.window.system import LEAST_CURVATURE, WindowSystem
+
+GAUGE_WEIGHT = 1e9
+"""Of the prior that holds the first keyframe: far above what images say, far below what float64 resolves."""
+GAIN_WEIGHT, OFFSET_WEIGHT = 0.15, 1e-2
+"""Of the weak priors that draw (a, b) to zero."""
+DAMPING, LEAST_DAMPING, MOST_DAMPING = 1e-4, 1e-6, 1e3
+
+
+class Adjustment(NamedTuple):
+    """How an optimisation went."""
+
+    energy_before: float
+    energy_after: float
+    steps: int
+    inlier_share: float
+    """Edges within their keyframe's threshold."""
+
+
+@dataclass
+class Window:
+    """Keyframes, points and prior; with `calibrate` the intrinsics of all keyframes, too.
+
+    Intrinsics that images cannot say are held: see `calibration.py`. With a rig static stereo gives the unit.
+    """
+
+    config: WindowConfig
+    T_other_first: tuple[Float64[Tensor, "4 4"], ...] = ()
+    """Poses of a rig's further cameras against the first, whose images are the targets."""
+    frames: list[WindowFrame] = field(default_factory=list)
+    points: WindowPoints | None = None
+    prior: Prior | None = None
+    intrinsics: Float64[Tensor, "4"] | None = None
+    """(fx, fy, cx, cy) as they are now; None where the camera's own hold."""
+    start: Float64[Tensor, "4"] | None = None
+    """Where the intrinsics began: a weak prior draws them there."""
+    k_first: Float64[Tensor, "4"] | None = None
+    """Intrinsics at which the prior was linearised; None while it says nothing of them."""
+
+    def __post_init__(self) -> None:
+        if self.config.calibrate and self.T_other_first:
+            raise InputError("calibrate: expected False with a rig, whose further cameras it does not know.")
+
+    @property
+    def _shared(self) -> int:
+        """Unknowns after the keyframes'."""
+        return INTRINSICS if self.config.calibrate else 0
+
+    def add_frame(self, frame: WindowFrame) -> None:
+        """Add a keyframe as the newest. The first is held where it is, from the start.
+
+        A first keyframe that is held and later marginalised as if it had been free ruins the trajectory (measured): the
+        prior that holds it is marginalised with it.
+        """
+        if self.config.calibrate:
+            if self.intrinsics is None:
+                self.intrinsics = self.start = intrinsics_of(frame.target.camera)
+            frame = _recalibrated(frame, self.intrinsics)
+        self.frames.append(frame if self.frames else frame.linearised())
+        size = PER_FRAME * len(self.frames) + self._shared
+        if self.prior is None:
+            held = torch.tensor([GAUGE_WEIGHT] * POSE + [GAUGE_WEIGHT, GAUGE_WEIGHT], dtype=torch.float64)
+            self.prior = Prior(torch.diag(held), torch.zeros(PER_FRAME, dtype=torch.float64)).widened(size)
+        self.prior = self.prior.widened(size, self._shared)
+
+    def hold_scale(self, place: int = 1) -> None:
+        """Hold the distance of a keyframe from the first, which gives the unit where no point does."""
+        assert self.prior is not None
+        frame = self.frames[place] = self.frames[place].linearised()
+        first = self.frames[0]
+        t = (frame.T_cam_world @ torch.linalg.inv(first.T_cam_world))[:3, 3]
+        length2 = t.square().sum().clamp_min(1e-12)
+        H = self.prior.H.clone()
+        at = slice(place * PER_FRAME, place * PER_FRAME + 3)
+        H[at, at] += GAUGE_WEIGHT * torch.outer(t, t) / length2
+        self.prior = Prior(H, self.prior.g)
+
+    def add_points(self, points: WindowPoints) -> None:
+        """Add points to their hosts'."""
+        self.points = points if self.points is None else self.points.joined(points)
+
+    def estimate(self, points: WindowPoints) -> Estimate:
+        """Return where the keyframes and some points stand."""
+        return estimate_of(self.frames, points.rho, self.intrinsics)
+
+    @property
+    def targets(self) -> list[Target]:
+        """The keyframes' images."""
+        return [frame.target for frame in self.frames]
+
+    def others(self, points: WindowPoints) -> list[Other]:
+        """Return the further images of all keyframes, with the brightness that points show."""
+        if self.config.stereo_coupling <= 0:
+            return []
+        return [
+            fit_brightness(Other(place, target, T, torch.zeros(2, dtype=torch.float64)), points, self.config)
+            for place, frame in enumerate(self.frames)
+            for target, T in zip(frame.others, self.T_other_first, strict=False)
+            if target is not None
+        ]
+
+    def _weak_prior(self, estimate: Estimate) -> tuple[Float64[Tensor, "D"], Float64[Tensor, "D"]]:
+        """Return the weights that draw brightness and intrinsics to where they began, and how far they are from it."""
+        weak, at = torch.zeros(2, len(self.frames), PER_FRAME, dtype=torch.float64)
+        weak[:, POSE], weak[:, POSE + 1] = (GAIN_WEIGHT, OFFSET_WEIGHT) if self.config.affine else (GAUGE_WEIGHT,) * 2
+        at[:, POSE:] = estimate.affine
+        if estimate.intrinsics is None:
+            return weak.flatten(), at.flatten()
+        assert self.start is not None
+        young = self.k_first is None and len(self.frames) < MIN_KEYFRAMES
+        weights = prior_weights(self.frames[0].target.camera, young=young)
+        return torch.cat([weak.flatten(), weights]), torch.cat([at.flatten(), estimate.intrinsics - self.start])
+
+    def linearize(
+        self,
+        points: WindowPoints,
+        estimate: Estimate,
+        thresholds: Tensor | None,
+        others: Sequence[Other] = (),
+        *,
+        alone: bool = False,
+    ) -> WindowSystem:
+        """Return the normal equations of all keyframes and some points, with all priors unless they are `alone`."""
+        T_first = None
+        if self.config.first_estimates and any(frame.T_first is not None for frame in self.frames):
+            T_first = first_poses(self.frames, estimate.T_cam_world)
+        system = linearize_window(
+            self.targets,
+            points,
+            estimate,
+            self.config,
+            T_first=T_first,
+            k_first=self.k_first if self.config.first_estimates else None,
+            thresholds=thresholds,
+            others=others,
+        )
+        if alone:
+            return system
+        H, g, energy = system.H.clone(), system.g.clone(), system.energy
+        weak, at = self._weak_prior(estimate)
+        H.diagonal().add_(weak)
+        g += weak * at
+        energy += 0.5 * float((weak * at.square()).sum())
+        if self.prior is not None:
+            d = difference(self.frames, estimate, self.k_first)
+            H += self.prior.H
+            g += self.prior.g + self.prior.H @ d
+            energy += float(d @ self.prior.g + 0.5 * d @ self.prior.H @ d)
+        return system._replace(H=H, g=g, energy=energy)
+
+    def optimise(self, steps: int | None = None) -> Adjustment:
+        """Adjust all keyframes and points by Levenberg-Marquardt; a step is judged by the next linearisation."""
+        points = self.points
+        assert points is not None
+        estimate, others = self.estimate(points), self.others(points)
+        system = self.linearize(points, estimate, None, others)
+        before, damping, taken, K = system.energy, DAMPING, 0, len(self.frames)
+        for _ in range(self.config.steps if steps is None else steps):
+            step = _step(system, damping)
+            if step is None:
+                break
+            proposed = estimate.moved(*step)
+            there = self.linearize(points, proposed, system.thresholds, others)
+            if not there.energy < system.energy:
+                damping = max(damping * 10, 1e-3)
+                if damping > MOST_DAMPING:
+                    break
+                continue
+            small = system.energy - there.energy < self.config.tolerance * system.energy
+            estimate, system, taken = proposed, there, taken + 1
+            damping = max(damping * 0.3, LEAST_DAMPING)
+            if small:
+                break
+        further = [
+            [t for other, t in zip(others, system.thresholds[K:], strict=True) if other.host == i] for i in range(K)
+        ]
+        self.frames = [
+            replace(
+                frame,
+                T_cam_world=estimate.T_cam_world[i],
+                affine=estimate.affine[i],
+                thresholds=torch.stack([system.thresholds[i], *further[i]]),
+            )
+            for i, frame in enumerate(self.frames)
+        ]
+        if estimate.intrinsics is not None:
+            self.intrinsics = estimate.intrinsics
+            self.frames = [_recalibrated(frame, estimate.intrinsics) for frame in self.frames]
+            points = replace(points, ray=unit_rays(self.frames[0].target.camera, points.uv))
+        self.points = replace(
+            points, rho=estimate.rho, curvature=system.curvature.to(points.rho), inliers=system.inliers
+        )
+        share = float(system.inliers.sum()) / max(1, system.edges)
+        return Adjustment(before, system.energy, taken, share)
+
+    def refine_points(self, points: WindowPoints, steps: int = 3) -> WindowPoints:
+        """Return points with inverse ranges settled against all keyframes, which stay where they are.
+
+        Each point accepts or refuses its own steps.
+        """
+        estimate = self.estimate(points)._replace(intrinsics=None)
+        return settle_points(self.targets, points, estimate, self.config, self.others(points), steps)
+
+    def keep_points(self, keep: Tensor) -> None:
+        """Let all other points go."""
+        assert self.points is not None
+        self.points = self.points.take(keep.nonzero()[:, 0])
+
+    def drop_frame(self, place: int) -> tuple[WindowFrame, WindowPoints]:
+        """Marginalise a keyframe with its points: what they say of the others becomes the prior. Return them."""
+        points = self.points
+        assert points is not None
+        assert self.prior is not None
+        hosted = points.host == place
+        own = points.take(hosted.nonzero()[:, 0])
+        estimate = self.estimate(own)
+        others = [other for other in self.others(own) if other.host == place]
+        gone = self.frames[place]
+        known = [frame.thresholds for frame in self.frames if frame.thresholds is not None]
+        thresholds = None
+        if gone.thresholds is not None and len(known) == len(self.frames):
+            thresholds = torch.cat([torch.stack([each[0] for each in known]), gone.thresholds[1:]])
+        system = self.linearize(own, estimate, thresholds, others, alone=True)
+        used = system.inliers > 0
+        diagonal = torch.where(used, system.curvature + LEAST_CURVATURE, 1.0)
+        A, b = reduce(system.H, system.g, system.cross * used[:, None], diagonal, system.slope * used)
+        d = difference(self.frames, estimate, self.k_first)
+        H, g = A + self.prior.H, -b + self.prior.g + self.prior.H @ d
+        H, g = eliminate_frame(H, g, place)
+        # All that stay have seen the points that go: the prior holds them from now on.
+        self.frames = [frame.linearised() for at, frame in enumerate(self.frames) if at != place]
+        rest = points.take((~hosted).nonzero()[:, 0])
+        self.points = replace(rest, host=rest.host - (rest.host > place).long())
+        self.k_first = self.intrinsics if self.k_first is None else self.k_first
+        d = difference(self.frames, self.estimate(rest), self.k_first)
+        self.prior = Prior(H, g - H @ d)
+        return gone, own
+
+
+def _recalibrated(frame: WindowFrame, k: Float64[Tensor, "4"]) -> WindowFrame:
+    """Return a keyframe whose image's camera has other intrinsics."""
+    return replace(frame, target=replace(frame.target, camera=at_intrinsics(frame.target.camera, k)))
+
+
+def _step(system: WindowSystem, damping: float) -> tuple[Float64[Tensor, "D"], Float64[Tensor, "N"]] | None:
+    diagonal = system.curvature * (1 + damping) + LEAST_CURVATURE
+    A, b = reduce(system.H, system.g, system.cross, diagonal, system.slope)
+    # A keyframe that sees nothing has no curvature either: it must not keep the others from moving.
+    A.diagonal().add_(system.H.diagonal() * damping + LEAST_CURVATURE)
+    x, ok = solve_ldl(A, b)
+    return (x, back_substitute(x, system.cross, diagonal, system.slope)) if bool(ok) else None

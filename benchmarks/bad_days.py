@@ -206,7 +206,7 @@ def noise(recording: Recording, deviation: float, seed: int = 0) -> Recording:
     return recording.with_images(change)
 
 
-def covered(recording: Recording, share: float, mask: Tensor | None = None, seed: int = 0) -> Recording:
+def covered(recording: Recording, share: float, mask: Tensor | None = None, seed: int = 0, start: int = 0) -> Recording:
     """Put a round textured patch before the camera, which sways about and carries its texture with it.
 
     Args:
@@ -214,6 +214,7 @@ def covered(recording: Recording, share: float, mask: Tensor | None = None, seed
         share: Part of the solid angle that may be used and is covered while the patch is in its middle place.
         mask: Pixels that may be used; all by default.
         seed: Of the texture.
+        start: First frame that is covered.
     """
     ray = recording.camera.ray_grid(dtype=torch.float64)
     area = recording.camera.solid_angle(recording.camera.pixel_grid(dtype=torch.float64))
@@ -227,6 +228,8 @@ def covered(recording: Recording, share: float, mask: Tensor | None = None, seed
     points = ray.float()
 
     def change(number: int, image: Image) -> Image:
+        if number < start:
+            return image
         t = number / 30
         forward = _direction(0.7 * math.sin(1.3 * t) + 0.25 * t, elevation + 0.1 * math.sin(0.9 * t)).float()
         side = torch.nn.functional.normalize(torch.tensor([float(forward[2]), 0.0, -float(forward[0])]), dim=0)

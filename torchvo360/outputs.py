@@ -200,7 +200,7 @@ def describe(summary: dict[str, Any], folder: Path) -> list[str]:
         f"map: {summary['points']} points from {summary['keyframes']} keyframes{parts}",
     ]
     if "intrinsics" in summary:
-        lines.append("intrinsics fx, fy, cx, cy: " + ", ".join(_figure(value) for value in summary["intrinsics"]))
+        lines.append("intrinsics fx, fy, cx, cy: " + ", ".join(f"{value:.6g}" for value in summary["intrinsics"]))
     if figures := [*(name for name in ERRORS if name in summary)]:
         figures += ["coverage", "fps"]
         width = max(map(len, figures))

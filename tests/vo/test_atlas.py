@@ -1,7 +1,8 @@
-"""The record of a run: frames follow their keyframes, maps find their place and size, loops move all that hangs on them."""
+"""The record of a run: frames follow their keyframes, maps find their place and size, loops move what hangs on them."""
 
 import math
 from dataclasses import dataclass, field
+from itertools import pairwise
 
 import pytest
 import torch
@@ -74,7 +75,7 @@ S_SECOND = similarity(2.5, 1.0, -2.0, 0.5, 0.4, 2.0, -0.3)
 
 
 def two_maps() -> tuple[Atlas, list[Tensor]]:
-    """Keyframes 0 to 9 in a first map, 10 to 19 in a second one that does not know its place; and all their true poses."""
+    """Keyframes 0 to 9 in a first map, 10 to 19 in a second that does not know its place; and all their true poses."""
     true = circle(20)
     atlas = Atlas()
     atlas.begin(Keys(dict(enumerate(true[:10]))))
@@ -187,7 +188,7 @@ def test_a_third_map_is_placed_by_a_second_that_has_been_placed():
 
 
 def test_a_loop_within_a_map_joins_nothing():
-    atlas, true = two_maps()
+    atlas, _ = two_maps()
     assert not atlas.join(edge(0, 9, EYE))
     assert not atlas.join(edge(19, 10, EYE))
     assert all(torch.equal(S, EYE) for S in atlas.S_world_map)
@@ -232,7 +233,7 @@ def drifted(count: int = 24, *, scale: float = 1.01) -> tuple[Atlas, list[Tensor
     """A walk around a circle, every step a little too long and turned a little, with the loop that closes it."""
     true = circle(count)
     poses, size = [EYE], 1.0
-    for before, after in zip(true[:-1], true[1:], strict=True):
+    for before, after in pairwise(true):
         step = lie.se3_inverse(before) @ after @ motion(0.0, 0.0, 0.0, 0.0003, 0.001, 0.0)
         size *= scale
         poses.append(poses[-1] @ lie.se3(step[:3, :3], step[:3, 3] * size))
@@ -272,12 +273,15 @@ def test_a_loop_takes_the_drift_back_and_the_frames_between_keyframes_go_along()
         torch.testing.assert_close(relative[:3, :3], halfway[:3, :3], rtol=0, atol=1e-9)
         torch.testing.assert_close(relative[:3, 3], halfway[:3, 3] * size, rtol=0, atol=1e-9)
     earlier = atlas.final(before)
-    torch.testing.assert_close(earlier[46].T_world_cam, before[23]), "what was before the loops is still to be had"
+    # What was before the loops is still to be had.
+    torch.testing.assert_close(earlier[46].T_world_cam, before[23])
 
 
 def test_where_the_metre_is_known_a_loop_changes_no_scale():
     atlas, _, loop = drifted(scale=1.0)
-    spoiled = loop._replace(S_j_i=loop.S_j_i @ similarity(1.05, 0, 0, 0, 0, 0, 0), information=1e2 * loop.information / 1e6)
+    spoiled = loop._replace(
+        S_j_i=loop.S_j_i @ similarity(1.05, 0, 0, 0, 0, 0, 0), information=1e2 * loop.information / 1e6
+    )
     sizes = {}
     for metric in (False, True):
         keys = atlas.corrected([spoiled], CONFIG, metric=metric)

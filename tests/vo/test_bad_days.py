@@ -216,7 +216,8 @@ FAULTS: dict[str, Callable[[Recording, torch.Tensor], Recording]] = {
     "yaw_jump": lambda day, mask: bad_days.yaw_jump(day, at=60),
     "exposure_jumps": lambda day, mask: bad_days.exposure_jumps(day),
     "noise": lambda day, mask: bad_days.noise(day, 0.06),
-    "moving_third": lambda day, mask: bad_days.covered(day, 1 / 3, mask),
+    "moving_sixth": lambda day, mask: bad_days.covered(day, 1 / 6, mask),
+    "moving_third": lambda day, mask: bad_days.covered(day, 1 / 3, mask, start=40),
     "half_sky": lambda day, mask: bad_days.half_sky(day, mask),
 }
 

@@ -229,7 +229,7 @@ def test_the_window_mends_a_wrong_start_at_once(sharp, monkeypatch, error_deg):
     starts = spoil_the_first_start(monkeypatch, error_deg)
     odometry = VisualOdometry(sharp.sequence.camera)
     online = [odometry.step(frame) for frame in sharp.frames]
-    begun = [estimate for estimate in online if estimate.state == State.TRACKING][0]
+    begun = next(estimate for estimate in online if estimate.state == State.TRACKING)
     true = sharp.T_cam_first(begun.index).inverse()[:3, 3]
     assert direction_deg(begun.T_world_cam[:3, 3], true) < 1
     assert {estimate.reason for estimate in online[begun.index :]} == {"ok"}, "confirmed: nothing is left to correct"

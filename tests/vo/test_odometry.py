@@ -258,6 +258,10 @@ def test_frames_that_cannot_be_used_get_a_prediction_and_the_run_goes_on(walk, p
     good = [k for k in range(len(walk)) if k not in dark]
     assert errors(result, walk, good).ate_percent < 0.1
     assert errors(result, walk).ate_percent < 0.8
+    bridged = result.trajectory.positions[dark.start - 1 : dark.stop + 1].diff(dim=0).norm(dim=-1)
+    inner = bridged[1:-1]
+    assert len(inner) == 0 or float(inner.max() / inner.min()) < 1.01, "an even motion between those that were found"
+    assert float(bridged.max() / bridged.min()) < 1.1
     assert State.LOST not in states(result)
 
 
@@ -481,7 +485,7 @@ def retained_frames() -> int:
 
 @pytest.mark.parametrize("stop_after", [None, 4, 5], ids=["walk", "stops_at_the_start", "stops_after_it"])
 def test_frames_are_not_retained(walk, stop_after):
-    """The window's keyframes and the last frame found; where the camera stops before its start is checked, what waits."""
+    """The window's keyframes and the last frame; what waits, where the camera stops before its start is checked."""
     before = retained_frames()
     order = list(range(70)) if stop_after is None else [*range(stop_after), *[stop_after - 1] * 66]
     odometry = VisualOdometry(walk.camera)

@@ -187,7 +187,11 @@ class Starter:
         start = start.rescaled(self._unit if unit is None else unit)
         start.key.T_world_key = self._T_world_ref
         mapper = Mapper.begun(start.key, self._builder, self._config, known=False)
-        mapper.open(frame, start.T_cam_key[frame.index] @ lie.se3_inverse(start.key.T_world_key), start.affine)
+        placed = sorted((f for f in self._corners.pending if f.index in start.T_cam_key), key=lambda f: f.index)
+        T_key_world = lie.se3_inverse(start.key.T_world_key)
+        # One frame between, where there is one: what moves by itself can pass for still in two images, hardly in three.
+        chosen = [*placed[: len(placed) // 2][-1:], frame] if len(placed) > 1 else [frame]
+        mapper.open([(f, start.T_cam_key[f.index] @ T_key_world, start.affine[f.index]) for f in chosen])
         first, newest = mapper.reference(0), mapper.reference()
         waiting, earlier = self._corners.pending, self._earlier
         if self._config.window.calibrate:

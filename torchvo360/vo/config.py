@@ -23,7 +23,7 @@ class OdometryConfig:
     """Intensities at or above this are clipped and not used."""
     weak_inliers: float = 0.65
     """Share of agreeing gradient below which the other hypotheses are searched, and the frame is WEAK."""
-    lost_inliers: float = 0.5
+    lost_inliers: float = 0.4
     """Share below which the frame is LOST: false minima reach 0.07, true ones on real video at least 0.74."""
     restart_after: int = 15
     """Lost frames in a row after which a new map is started and joined to the old one."""

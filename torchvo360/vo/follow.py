@@ -15,11 +15,13 @@ from torchvo360.vo.frame import FrameBuilder, PyramidFrame
 from torchvo360.vo.keyframe import Keyframe, KeyPoints, make_keyframe
 from torchvo360.vo.mapper import Mapper
 from torchvo360.vo.recover import Recovery
-from torchvo360.vo.track import Track, track
+from torchvo360.vo.track import Track, judge_points, track
 
 MAX_PREDICTED = 10
 """Frames in a row that are given the last motion; then the camera is taken to stand, or a prediction would run away."""
-CLEARLY = 0.05
+DISCARDED = -1.0
+"""Points of this score or less when a keyframe is made leave the map."""
+CLEARLY = 0.15
 """An earlier keyframe with this many more inliers than the present one is where a jump has led."""
 SUDDEN = 0.15
 """A fall of inliers from one frame to the next by this much makes a track doubtful."""
@@ -108,7 +110,8 @@ class Follower:
             found = self.recovery.search(self.key, frame, self.placed, self.T_placed_key, self.affine, found)
         if found is not None and self._doubtful(found):
             # What looks alike is not always the same place: after a jump an earlier keyframe may know the frame better.
-            self.elsewhere = self.recovery.relocalise(frame, found.inliers + CLEARLY, afresh=True)
+            better = max(config.weak_inliers, found.inliers + CLEARLY)
+            self.elsewhere = self.recovery.relocalise(frame, better, afresh=True) if better < 1 else None
             found = None if self.elsewhere is not None else found
         if found is None or found.inliers < config.lost_inliers:
             self.unplaced.append(frame.index)
@@ -123,6 +126,7 @@ class Follower:
         self.age += 1
         if found.inliers >= config.weak_inliers:
             self.mapper.observe(frame, found.T_cam_key, found.affine)
+        judge_points(self.key, frame, found, config.map.max_difference)
         if self._keyframe_due(found):
             self._new_keyframe(frame, found)
         self.place(frame)
@@ -130,7 +134,7 @@ class Follower:
 
     def _doubtful(self, found: Track) -> bool:
         """Return whether a track is much worse than the last, or lies far from where the camera had been going."""
-        if found.inliers < max(self.config.weak_inliers, self.inliers - SUDDEN):
+        if found.inliers < self.inliers - SUDDEN:
             return True
         T_cam_last = found.T_cam_key @ lie.se3_inverse(self.T_placed_key)
         usual = max(MIN_JUMP_DEG, math.degrees(self.key.mean_flow(self.motion)) * JUMP * (len(self.unplaced) + 1))
@@ -154,6 +158,7 @@ class Follower:
         a, b = newest.affine + found.affine
         b = b + (float(found.affine[0].exp()) - 1) * newest.affine[1]
         T_new_old = found.T_cam_key
+        self.mapper.discard(self.key.points.score <= DISCARDED)
         self.left = self.mapper.add_keyframe(frame, T_new_old @ newest.T_cam_world, torch.stack([a, b]))
         # What was bridged stays where it is, against the keyframe that is now the newest.
         self.bridged = {index: T @ lie.se3_inverse(T_new_old) for index, T in self.bridged.items()}

@@ -70,8 +70,8 @@ class Start:
     key: Keyframe
     T_cam_key: dict[int, Float64[Tensor, "4 4"]]
     """By frame index, for some of the frames, the newest included."""
-    affine: Float64[Tensor, "2"]
-    """Of the newest frame."""
+    affine: dict[int, Float64[Tensor, "2"]]
+    """Of these frames."""
 
     def rescaled(self, unit: float) -> "Start":
         """Return the start with a median inverse range of `unit` instead of 1."""
@@ -235,7 +235,7 @@ class Initialiser:
         self._search(key, newest, joint.T_tgt_ref[-1], joint.affine[-1])
         self.reason = "ok"
         poses = {frame.index: T for frame, T in zip(frames, joint.T_tgt_ref, strict=True)}
-        return Start(key, poses, joint.affine[-1])
+        return Start(key, poses, {frame.index: ab for frame, ab in zip(frames, joint.affine, strict=True)})
 
     def _search(self, key: Keyframe, frame: PyramidFrame, T_cam_key: Tensor, affine: Tensor) -> None:
         rho, variance, _ = key.points

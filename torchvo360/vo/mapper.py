@@ -50,6 +50,8 @@ class Mapper:
     """The points they left, in their own cameras."""
     candidates: Candidates | None = None
     """Of the newest keyframe."""
+    _shown: Int64[Tensor, "N"] = field(default_factory=lambda: torch.zeros(0, dtype=torch.int64))
+    """The points of the last `reference`, in its order."""
 
     @classmethod
     def begun(cls, key: Keyframe, builder: FrameBuilder, config: OdometryConfig, *, known: bool) -> "Mapper":
@@ -81,16 +83,25 @@ class Mapper:
         self.window.add_frame(WindowFrame(frame.index, frame.targets[0], T_cam_world, affine, frame.others))
         self.frames.append(frame)
 
-    def open(self, frame: PyramidFrame, T_cam_world: Float64[Tensor, "4 4"], affine: Float64[Tensor, "2"]) -> None:
-        """Add the second keyframe of a start, whose distance from the first is the unit."""
-        self._add(frame, T_cam_world, affine)
-        self.window.hold_scale()
+    def open(self, placed: list[tuple[PyramidFrame, Float64[Tensor, "4 4"], Float64[Tensor, "2"]]]) -> None:
+        """Add the further keyframes of a start; the newest one's distance from the first is the unit.
+
+        Args:
+            placed: Frames in their order, each with T_cam_world and (a, b).
+        """
+        for frame, T_cam_world, affine in placed:
+            self._add(frame, T_cam_world, affine)
+        newest = len(placed)
+        self.window.hold_scale(newest)
         self._adjust(START_STEPS)
         # The start's points have given the pose; with it their ranges are found afresh, more exactly than the start's.
         started = self.window.points
         self.window.points = None
-        self._new_points(0, [1])
-        self._new_points(1, [0])
+        everything = list(range(newest + 1))
+        for place in everything:
+            # The farthest keyframe's great circles are walked: its parallax says most.
+            others = sorted((other for other in everything if other != place), key=lambda at: -abs(at - place))
+            self._new_points(place, others[: self.config.trace.views])
         if self.window.points is None or len(self.window.points) < self.config.track.min_points:
             self.window.points = started
         self._adjust(START_STEPS)
@@ -134,6 +145,19 @@ class Mapper:
         if (waiting := self.candidates) is not None:
             frame = next(frame for frame in self.frames if frame.index == waiting.frame.index)
             self.candidates = replace(waiting, frame=frame, ray=self.builder.rays(waiting.pixel))
+
+    def discard(self, wrong: Bool[Tensor, "N"]) -> None:
+        """Let points go that the frames since the newest keyframe contradict.
+
+        Args:
+            wrong: By the order of the last `reference`.
+        """
+        points = self.window.points
+        if points is None or len(wrong) != len(self._shown):
+            return
+        keep = torch.ones(len(points), dtype=torch.bool, device=wrong.device)
+        keep[self._shown[wrong]] = False
+        self.window.keep_points(keep)
 
     def _cull(self) -> None:
         assert self.window.points is not None
@@ -258,6 +282,7 @@ class Mapper:
         index = ok.nonzero()[:, 0]
         index = index[pixel[index].argsort(stable=True)]
         ray, rho = ray[:, index].contiguous(), rho[index]
+        self._shown = index
         return Keyframe(
             index=frame.index,
             T_world_key=lie.se3_inverse(self.window.frames[place].T_cam_world),

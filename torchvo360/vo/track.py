@@ -11,11 +11,15 @@ from torchvo360 import lie
 from torchvo360.agreement import share_beyond_chance
 from torchvo360.alignment import AlignConfig, solve_level
 from torchvo360.checks import InputError, check_finite_number
+from torchvo360.depth import InverseRange
 from torchvo360.residuals.direct import Reference, look_up
 from torchvo360.residuals.weights import LossConfig
 from torchvo360.solve import LMConfig
 from torchvo360.vo.frame import PyramidFrame
 from torchvo360.vo.keyframe import Keyframe, KeyPoints
+
+WORST, BEST = -3.0, 2.0
+"""Bounds of a tracked point's score: a frame that does not show it takes 1, one that does gives half."""
 
 
 @dataclass(kw_only=True)
@@ -132,6 +136,26 @@ def measure_keyframe(key: Keyframe, config: TrackConfig, max_relative_variance: 
     index = key.trusted(max_relative_variance).nonzero()[:, 0]
     eye, none = torch.eye(4, dtype=torch.float64), torch.zeros(2, dtype=torch.float64)
     return measure(key, key.frame, eye, none, _thinned(index, config.points_by_level[0]))
+
+
+def judge_points(key: KeyPoints, frame: PyramidFrame, found: Track, max_difference: float) -> None:
+    """Mark a keyframe's points up or down by how a tracked frame shows them: what moves or is hidden loses its say.
+
+    Args:
+        key: The keyframe; its points' scores are changed.
+        frame: The frame.
+        found: Where it was found.
+        max_difference: Intensities that differ by more than this, and by three median differences, do not fit.
+    """
+    rho, variance, score = key.points
+    reference = _reference(key, 0, torch.arange(len(rho), device=rho.device), 1)
+    T, ab = found.T_cam_key[None].to(rho), found.affine[None].to(rho)
+    samples = look_up(reference, frame.targets[0], T, ab)
+    off, seen = samples.residual[0, 0].abs(), samples.weight[0, 0] > 0
+    used = seen & (score > 0)
+    usual = float(off[used].median()) if bool(used.any()) else 0.0
+    change = torch.where(off > max(max_difference, 3 * usual), -1.0, 0.5)
+    key.points = InverseRange(rho, variance, (score + change * seen).clamp(WORST, BEST))
 
 
 def measure(

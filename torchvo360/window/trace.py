@@ -139,19 +139,24 @@ def _walk(
 def _pattern_cost(
     points: WindowPoints, rho: Float[Tensor, "N M"], views: list[View], config: TraceConfig
 ) -> Float[Tensor, "N M"]:
-    """Return the mean square difference of the whole pattern at some inverse distances, over all views that see it."""
+    """Return the mean square difference of the whole pattern at some inverse distances, in the view that fits worst.
+
+    What moves by itself may fit one view at a false range, but then not the other; a view that does not see a place
+    says nothing of it.
+    """
     weight = points.weight
-    total, seen = torch.zeros_like(rho), torch.zeros_like(rho)
+    whole = weight.sum(1, keepdim=True).clamp_min(1e-6)
+    worst, seen_by = torch.zeros_like(rho), torch.zeros_like(rho)
     for view in views:
         T = view.T_tgt_host.to(rho)
         turned = torch.einsum("ij,jnp->inp", T[:3, :3], points.ray)
         ray = turned[:, :, None] + rho[..., None] * T[:3, 3, None, None, None]
         value = look_up_usable(view.target, ray)
         expected = (points.value * math.exp(float(view.affine[0])) + float(view.affine[1]))[:, None]
-        ok = torch.isfinite(value)
-        w = weight[:, None] * ok
+        w = weight[:, None] * torch.isfinite(value)
         square = (value.nan_to_num(nan=0.0) - expected).abs().clamp_max(config.max_difference).square()
-        total += (square * w).sum(-1)
-        seen += w.sum(-1)
-    most = len(views) * weight.sum(1, keepdim=True)
-    return torch.where(seen > 0.5 * most.clamp_min(1e-6), total / seen.clamp_min(1e-6), NEVER)
+        total = w.sum(-1)
+        sees = total > 0.5 * whole
+        worst = torch.where(sees, torch.maximum(worst, (square * w).sum(-1) / total.clamp_min(1e-6)), worst)
+        seen_by += sees
+    return torch.where(seen_by > 0, worst, NEVER)

@@ -21,7 +21,8 @@ first 300 frames of the recorded one (their names begin with walk_). Each line o
     MB, grown       largest memory of the process during the run, and growth over its last two thirds
 
 The truth of the walk is stella_vslam's trajectory in its own unit; "mm" are thousandths of it. There the two-view
-reference is compared, too, and the reversed run with the forward one.
+reference is compared, too, and the reversed run with the forward one. Where a path ends at its beginning, a line says
+how far the estimate's end is off its place as seen from its start, with and without the loops' correction.
 """
 
 import argparse
@@ -60,6 +61,8 @@ SEEDS = {"synthetic": [0, 1, 2], "house": [0, 1, 2, 3, 4], "walk": [0], "bad_day
 FPS = 30
 OPERATOR = "below:-18"
 """The mask of the walk: the man who carries the camera."""
+CLOSED = ("loop", "turned_loop")
+"""Days whose path ends where it began."""
 WALK_FRAMES = 300
 """Frames of the walk that a bad day spoils."""
 
@@ -269,6 +272,19 @@ def measure_walk(arguments: argparse.Namespace) -> Iterator[Row]:
             print(f"    reversed against forward: {apart_mm:.2f} mm ATE", flush=True)
 
 
+def _print_end(result: OdometryResult, truth: Trajectory) -> None:
+    after, before = (end_percent(path, truth) for path in (result.trajectory, result.before_loops))
+    print(f"    {len(result.loops)} loops: the end is {after:.4f} % of the path off its place against the start, "
+          f"{before:.4f} % before their correction", flush=True)  # fmt: skip
+
+
+def end_percent(trajectory: Trajectory, truth: Trajectory) -> float:
+    """Return the error of the last position as seen from the first, in percent of the true path."""
+    figures = evaluate(trajectory, truth)
+    moved, true = (path.positions[-1] - path.positions[0] for path in (trajectory, truth))
+    return 100 * float((figures.T_truth_estimate[:3, :3] @ moved - true).norm()) / figures.path_length_m
+
+
 def _print_two_view(trajectory: Trajectory, pairs: list[dict]) -> None:
     rotation, direction = two_view_errors_deg(trajectory, pairs)
     print(f"    {len(rotation)} two-view estimates: rotation {rotation.median():.3f} deg, "
@@ -281,7 +297,10 @@ def measure_bad_days(arguments: argparse.Namespace) -> Iterator[Row]:
     for seed in arguments.seeds:
         for name, day in synthetic_days(seed, arguments.frames or 150, arguments.size or (512, 256)):
             if not arguments.only or name in arguments.only:
-                yield measure(day, clean, seed=seed, name=name)[0]
+                row, result = measure(day, clean, seed=seed, name=name)
+                yield row
+                if name in CLOSED:
+                    _print_end(result, day.truth)
     data = arguments.data or SHARED / "theta_walk"
     if not (data / "stella_vslam.txt").is_file():
         print(f"--data: no recorded walk in {data}, so that only the rendered days are measured.", flush=True)

@@ -288,6 +288,7 @@ def test_candidates_ripen_in_the_frames_that_follow_and_become_points(scene):
     assert len(ripe) > 0.5 * waiting
     mapper.add_keyframe(scene.frame(9), scene.T(9), NO_CHANGE)
     points = mapper.window.points
+    assert points is not None
     own = points.pixel[points.host == 1]
     became = torch.tensor([pixel in ripe for pixel in own.tolist()])
     assert int(became.sum()) > 0.6 * len(ripe)

@@ -85,6 +85,24 @@ def fuse(prior: InverseRange, match: EpipolarMatch, config: FilterConfig) -> Inv
     )
 
 
+def guess_around(
+    ray: Float[Tensor, "3 M"], known_ray: Float[Tensor, "3 N"], known_rho: Float[Tensor, "N"], spread_rad: float
+) -> InverseRange:
+    """Guess inverse ranges by those of the directions around, as loose priors: half their size, score 0.
+
+    Args:
+        ray: Unit rays of the points to guess.
+        known_ray: Unit rays of at least one point that is known.
+        known_rho: Their inverse ranges.
+        spread_rad: Standard deviation of the Gaussian by which directions count; far from all it is their median.
+    """
+    weight = torch.exp((ray.T @ known_ray - 1) / spread_rad**2)
+    median = known_rho.median()
+    rho = (weight @ known_rho + 0.02 * median) / (weight.sum(1) + 0.02)
+    rho = torch.maximum(torch.minimum(rho, 8 * median), 0.05 * median)
+    return InverseRange(rho, (0.5 * rho) ** 2, torch.zeros_like(rho))
+
+
 def box_sums(grid: Float[Tensor, "C H W"], camera: Camera, radius: int) -> Float[Tensor, "C H W"]:
     """Return sums over squares of `2 radius + 1` pixels around every pixel, across the seam and the poles."""
     padded = pad_image(grid, camera, radius + 1)

@@ -55,12 +55,9 @@ def select_pixels(
     check_shape("strength", strength, f"{camera.height} {camera.width}")
     check_shape("usable", usable, f"{camera.height} {camera.width}")
     cell = equal_area_cells(camera, count, device=strength.device).flatten()
-    candidate = (usable & (strength >= minimum)).flatten().nonzero()[:, 0]
-    # Sorted by cell, then by falling strength: the first of each run is the cell's best. Stable, so ties go to the
-    # lower index and the choice is deterministic.
-    by_strength = candidate[strength.flatten()[candidate].argsort(descending=True, stable=True)]
-    order = by_strength[cell[by_strength].argsort(stable=True)]
-    run = cell[order]
-    first = torch.ones_like(run, dtype=torch.bool)
-    first[1:] = run[1:] != run[:-1]
-    return order[first].sort().values
+    flat = strength.flatten().masked_fill(~(usable & (strength >= minimum)).flatten(), -torch.inf)
+    most = flat.new_full((int(cell.max()) + 1,), -torch.inf).scatter_reduce(0, cell, flat, "amax")
+    best = ((flat == most[cell]) & (flat > -torch.inf)).nonzero()[:, 0]
+    # Equally strong pixels of a cell: the lowest index.
+    lowest = torch.full_like(most, len(flat), dtype=torch.int64).scatter_reduce(0, cell[best], best, "amin")
+    return best[lowest[cell[best]] == best]

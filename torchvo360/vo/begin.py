@@ -93,6 +93,11 @@ class Starter:
         """Whether the present map is one of learned ranges that corners are to replace."""
         return self._phase is _Phase.SETTLING
 
+    @property
+    def confirming(self) -> bool:
+        """Whether the present map rests on a start that its corners have not confirmed yet."""
+        return self._phase is _Phase.CONFIRMING
+
     def _new_corners(self) -> Initialiser:
         config = self._config
         return Initialiser(

@@ -16,7 +16,15 @@ from torch import Tensor
 from torchvo360 import lie
 from torchvo360.alignment import solve_level
 from torchvo360.checks import InputError, check_finite_number
-from torchvo360.depth import EpipolarConfig, FilterConfig, InverseRange, fuse, search_great_circles, smooth
+from torchvo360.depth import (
+    EpipolarConfig,
+    FilterConfig,
+    InverseRange,
+    fuse,
+    guess_around,
+    search_great_circles,
+    smooth,
+)
 from torchvo360.motion.essential import TwoView
 from torchvo360.residuals.direct import Reference, Target
 from torchvo360.residuals.weights import LossConfig
@@ -31,6 +39,9 @@ CHECK_PARALLAX = 2.0
 """A start is checked once the parallax is this many times its own."""
 CHECK_DIRECTION_DEG, CHECK_ROTATION_DEG = 8.0, 3.0
 """Differences between a map and fresh corners beyond which the map is wrong: corners are within 3 and 0.5 deg."""
+
+CORNER_SPREAD_RAD = 0.06
+"""How far a corner's range speaks for the points around it: 3.4 deg."""
 
 
 @dataclass(kw_only=True)
@@ -206,7 +217,8 @@ class Initialiser:
         t = view.t_tgt_ref * unit
         rho = view.rho[ahead] / unit
         near = (rho > 0.02) & (rho < 10)
-        key.points = _spread(key.ray, self.tracks.origins[ahead][near].to(key.ray), rho[near].to(key.ray))
+        corners = self.tracks.origins[ahead][near].to(key.ray)
+        key.points = guess_around(key.ray, corners.T, rho[near].to(key.ray), CORNER_SPREAD_RAD)
         T_last = lie.se3(view.R_tgt_ref, t)
         affine = torch.zeros(2, dtype=torch.float64)
         for _ in range(2):
@@ -283,13 +295,6 @@ class Initialiser:
         length = torch.linalg.vector_norm(T_last[:3, 3]) / torch.linalg.vector_norm(T[-1, :3, 3]).clamp_min(1e-9)
         T[-1, :3, 3] *= length
         return T, affine
-
-
-def _spread(ray: Tensor, corner_ray: Tensor, corner_rho: Tensor) -> InverseRange:
-    """Give every point the inverse range of the corners around it, by a Gaussian of 3.4 deg, as a loose prior."""
-    weight = torch.exp((ray.T @ corner_ray.T - 1) / 0.06**2)
-    rho = ((weight @ corner_rho + 0.02) / (weight.sum(1) + 0.02)).clamp(0.05, 8.0)
-    return InverseRange(rho, (0.5 * rho) ** 2, torch.zeros_like(rho))
 
 
 def _together(targets: list[Target]) -> Target:

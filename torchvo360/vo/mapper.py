@@ -1,5 +1,6 @@
 """The map: keyframes whose poses, brightness and points are adjusted together, and what they leave behind."""
 
+import math
 from dataclasses import dataclass, field, replace
 
 import torch
@@ -7,11 +8,10 @@ from jaxtyping import Bool, Float64, Int64
 from torch import Tensor
 
 from torchvo360 import lie
-from torchvo360.depth import InverseRange
+from torchvo360.depth import InverseRange, guess_around
 from torchvo360.image import equal_area_cells, select_pixels
 from torchvo360.residuals.direct import look_up_value
 from torchvo360.vo.candidates import Candidates
-from torchvo360.vo.carry import CarriedPoints
 from torchvo360.vo.cloud import PointCloud, to_cloud
 from torchvo360.vo.config import OdometryConfig
 from torchvo360.vo.frame import FrameBuilder, PyramidFrame
@@ -69,7 +69,8 @@ class Mapper:
         index = key.trusted(config.map.max_relative_variance).nonzero()[:, 0]
         rho, variance, _ = key.points
         cell = equal_area_cells(builder.cameras[0], config.map.points, device=rho.device).flatten()
-        index = index[_one_per_cell(cell[key.pixel[index]], (variance / rho.square().clamp_min(1e-12))[index])]
+        # By the gradient, not by V: a variance that goes with a noisy rho would prefer those that came out too near.
+        index = index[_one_per_cell(cell[key.pixel[index]], -key.slope[index])]
         information = config.track.noise**2 / variance[index] if known else None
         target = key.frame.targets[0]
         ray, pixel = key.ray[:, index], key.pixel[index]
@@ -214,16 +215,10 @@ class Mapper:
         if len(points) == 0 or len(known) == 0:
             self.candidates = None
             return
-        camera, noise = self.builder.cameras[0], self.config.track.noise
-        variance = noise**2 / known.curvature.clamp_min(1e-9)
-        around = CarriedPoints(known.pixel, self.builder.rays(known.pixel), InverseRange(known.rho, variance, variance))
-        self.candidates = Candidates(
-            frame,
-            points.pixel,
-            self.builder.rays(points.pixel),
-            strength.flatten()[points.pixel],
-            around.guess(points.pixel, camera),
-        )
+        ray, known_ray = self.builder.rays(points.pixel), self.builder.rays(known.pixel)
+        spacing = math.sqrt(4 * math.pi / self.config.map.points)
+        guess = guess_around(ray, known_ray, known.rho, spacing)
+        self.candidates = Candidates(frame, points.pixel, ray, strength.flatten()[points.pixel], guess)
 
     def observe(self, frame: PyramidFrame, T_cam_key: Float64[Tensor, "4 4"], affine: Float64[Tensor, "2"]) -> None:
         """Look for the newest keyframe's candidates in a tracked frame."""

@@ -191,9 +191,7 @@ class VisualOdometry:
         """Go on with a map that has just begun, in place of a young one if there is one."""
         atlas, first = self._atlas, not self._atlas.sessions
         if begun.reason == "start_corrected":
-            self._recovery.forget(self._remembered_before)
-            self._loops.forget(set(atlas.sessions[-1].mapper.poses()))
-            atlas.drop_session()
+            self._forget_map()
             atlas.begin(begun.mapper)
         elif begun.reason == "start_settled":
             earlier = [key for key in atlas.sessions[-1].mapper.poses() if key < begun.key]
@@ -253,8 +251,14 @@ class VisualOdometry:
     def _lose(self, follower: Follower, frame: PyramidFrame) -> FrameEstimate:
         if self._starter.settling and not follower.mapper.settled:
             # The network misjudged its only keyframe: the corners have to do without.
-            self._follower = None
-            self._atlas.drop_session()
+            self._forget_map()
+            return self._begin(frame)
+        if self._starter.confirming:
+            # Lost before the start was confirmed: a wrong start ends so, and nothing may be found again in its map.
+            T_world_cam = self._atlas.in_world(follower.T_map_cam)
+            unit = follower.median_rho()
+            self._forget_map()
+            self._starter.restart(T_world_cam, unit)
             return self._begin(frame)
         self._starter.rest()
         self._lost += 1
@@ -271,6 +275,13 @@ class VisualOdometry:
         self._starter.restart(T_world_cam, unit)
         begun = self._starter.add(frame)
         return self._take_over(begun, frame) if begun else _estimate(frame, T_world_cam, State.LOST, "restarting", None)
+
+    def _forget_map(self) -> None:
+        """Take back the present map, which turned out wrong, and all that was kept of it."""
+        self._recovery.forget(self._remembered_before)
+        self._loops.forget(set(self._atlas.sessions[-1].mapper.poses()))
+        self._atlas.drop_session()
+        self._follower = None
 
     def _relocalised(self, frame: PyramidFrame) -> FrameEstimate | None:
         """Look for a frame in the earlier keyframes, and go on from where it is found."""

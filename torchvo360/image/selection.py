@@ -61,3 +61,26 @@ def select_pixels(
     # Equally strong pixels of a cell: the lowest index.
     lowest = torch.full_like(most, len(flat), dtype=torch.int64).scatter_reduce(0, cell[best], best, "amin")
     return best[lowest[cell[best]] == best]
+
+
+MOST_CELLS = 4
+"""The number of cells grows at most by this factor to make up for those without a usable pixel."""
+
+
+def select_about(
+    strength: Float[Tensor, "H W"],
+    usable: Bool[Tensor, "H W"],
+    camera: Camera,
+    count: int,
+    *,
+    minimum: float,
+) -> Int64[Tensor, "N"]:
+    """Choose about `count` pixels as `select_pixels` does: the cells become smaller where many of them give none.
+
+    A sky, a mask or a blank wall would otherwise take its share of the points with it.
+    """
+    pixel = select_pixels(strength, usable, camera, count, minimum=minimum)
+    if not 0 < len(pixel) < 0.9 * count:
+        return pixel
+    cells = round(count * min(MOST_CELLS, count / len(pixel)))
+    return select_pixels(strength, usable, camera, cells, minimum=minimum)

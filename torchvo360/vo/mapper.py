@@ -1,6 +1,5 @@
 """The map: keyframes whose poses, brightness and points are adjusted together, and what they leave behind."""
 
-import math
 from dataclasses import dataclass, field, replace
 
 import torch
@@ -8,24 +7,16 @@ from jaxtyping import Bool, Float64, Int64
 from torch import Tensor
 
 from torchvo360 import lie
-from torchvo360.depth import InverseRange, guess_around
-from torchvo360.image import equal_area_cells, select_pixels
+from torchvo360.depth import InverseRange
+from torchvo360.image import equal_area_cells
 from torchvo360.residuals.direct import look_up_value
 from torchvo360.vo.candidates import Candidates
 from torchvo360.vo.cloud import PointCloud, to_cloud
 from torchvo360.vo.config import OdometryConfig
 from torchvo360.vo.frame import FrameBuilder, PyramidFrame
+from torchvo360.vo.fresh import fresh_points
 from torchvo360.vo.keyframe import Keyframe
-from torchvo360.vo.stereo import stereo_views
-from torchvo360.window import (
-    CENTRE,
-    View,
-    Window,
-    WindowFrame,
-    WindowPoints,
-    make_points,
-    trace,
-)
+from torchvo360.window import CENTRE, Window, WindowFrame, WindowPoints, make_points, project_points
 
 START_STEPS = 15
 """Steps of the first adjustment of a start."""
@@ -102,7 +93,7 @@ class Mapper:
         for place in everything:
             # The farthest keyframe's great circles are walked: its parallax says most.
             others = sorted((other for other in everything if other != place), key=lambda at: -abs(at - place))
-            self._new_points(place, others[: self.config.trace.views])
+            self._freshen(place, others[: self.config.trace.views])
         if self.window.points is None or len(self.window.points) < self.config.track.min_points:
             self.window.points = started
         self._adjust(START_STEPS)
@@ -127,7 +118,7 @@ class Mapper:
         others = list(range(place - 1, max(-1, place - 1 - self.config.trace.views), -1))
         # The middle one's great circles are walked: far enough to tell ranges apart, near enough to look alike.
         others.insert(0, others.pop(len(others) // 2))
-        self._new_points(place, others)
+        self._freshen(place, others)
         self._adjust()
         self._cull()
         left = []
@@ -173,52 +164,14 @@ class Mapper:
     def _cloud(self, frame: PyramidFrame, points: WindowPoints) -> PointCloud:
         relative = self.config.track.noise**2 / points.curvature.clamp_min(1e-12) / points.rho.square().clamp_min(1e-12)
         keep = (points.inliers >= 2) & (relative < self.config.map.max_relative_variance)
-        ray = points.ray[:, :, points.ray.shape[2] // 2] if points.ray.shape[2] == 1 else points.ray[:, :, CENTRE]
-        return to_cloud(ray[:, keep], points.rho[keep], points.pixel[keep], frame)
+        centre = CENTRE if points.ray.shape[2] > 1 else 0
+        return to_cloud(points.ray[:, keep, centre], points.rho[keep], points.pixel[keep], frame)
 
-    def _new_points(self, place: int, others: list[int]) -> None:
-        """Choose pixels of a keyframe, one in each cell, and trace them into other keyframes.
-
-        Those that are found become points at once, the others candidates, which the next frames search for.
-        """
-        config, window, frame = self.config, self.window, self.frames[place]
-        strength = self.builder.strength(frame)
-        pixel = select_pixels(
-            strength,
-            self.builder.usable(frame),
-            self.builder.cameras[0],
-            config.map.points,
-            minimum=config.map.min_gradient,
-        )
-        ray, start = self.builder.rays(pixel), strength.new_ones(len(pixel))
-        points = make_points(frame.targets[0], pixel, ray, start, config.window, place)
-        points = points.take((points.weight.sum(1) > 0).nonzero()[:, 0])
-        views, same_time = [self._view(place, other) for other in others], stereo_views(frame, self.builder)
-        traced = trace(points, frame.targets[0], [*views, *same_time], config.trace)
-        if same_time:
-            # Along a rig's baseline some are found that the motion's own curves cannot tell apart.
-            again = trace(points, frame.targets[0], [*same_time, *views], config.trace)
-            rho = torch.where(traced.found, traced.rho, again.rho)
-            traced = traced._replace(rho=rho, found=traced.found | again.found)
-        known = replace(points, rho=traced.rho).take(traced.found.nonzero()[:, 0])
-        known = window.refine_points(known)
-        known = known.take((known.inliers >= 1).nonzero()[:, 0])
-        window.add_points(known)
-        self._keep_candidates(
-            points.take(torch.isin(points.pixel, known.pixel, invert=True).nonzero()[:, 0]), known, strength, frame
-        )
-
-    def _keep_candidates(
-        self, points: WindowPoints, known: WindowPoints, strength: Tensor, frame: PyramidFrame
-    ) -> None:
-        """Follow points that could not be traced in the frames to come, with a guess by the known ones around."""
-        if len(points) == 0 or len(known) == 0:
-            self.candidates = None
-            return
-        ray, known_ray = self.builder.rays(points.pixel), self.builder.rays(known.pixel)
-        spacing = math.sqrt(4 * math.pi / self.config.map.points)
-        guess = guess_around(ray, known_ray, known.rho, spacing)
-        self.candidates = Candidates(frame, points.pixel, ray, strength.flatten()[points.pixel], guess)
+    def _freshen(self, place: int, others: list[int]) -> None:
+        """Give a keyframe points of its own."""
+        fresh = fresh_points(self.window, place, others, self.frames[place], self.builder, self.config)
+        self.window.add_points(fresh.points)
+        self.candidates = fresh.candidates
 
     def observe(self, frame: PyramidFrame, T_cam_key: Float64[Tensor, "4 4"], affine: Float64[Tensor, "2"]) -> None:
         """Look for the newest keyframe's candidates in a tracked frame."""
@@ -226,55 +179,37 @@ class Mapper:
             self.candidates.observe(frame, T_cam_key, affine, self.config.epipolar, self.config.filter)
 
     def _activate(self) -> None:
-        """Make points of the candidates whose ranges have become known; each lies in a cell of its own."""
+        """Make points of the candidates whose ranges have become known, where there are not many points yet."""
         candidates, config = self.candidates, self.config
         if candidates is None:
             return
+        place = self.frames.index(candidates.frame)
         ripe = candidates.ripe(config.map.max_relative_variance)
-        if len(ripe):
-            place = self.frames.index(candidates.frame)
-            ray, rho = candidates.ray[:, ripe], candidates.points.rho[ripe]
-            points = make_points(candidates.frame.targets[0], candidates.pixel[ripe], ray, rho, config.window, place)
-            points = self.window.refine_points(points)
-            self.window.add_points(points.take((points.inliers >= 1).nonzero()[:, 0]))
+        ripe = ripe[self._free(candidates.pixel[ripe], place)]
+        ray, rho = candidates.ray[:, ripe], candidates.points.rho[ripe]
+        points = make_points(candidates.frame.targets[0], candidates.pixel[ripe], ray, rho, config.window, place)
+        points = self.window.refine_points(points)
+        self.window.add_points(points.take((points.inliers >= 1).nonzero()[:, 0]))
 
-    def _view(self, host: int, other: int) -> View:
-        frames = self.window.frames
-        T = frames[other].T_cam_world @ lie.se3_inverse(frames[host].T_cam_world)
-        a = frames[other].affine[0] - frames[host].affine[0]
-        b = frames[other].affine[1] - a.exp() * frames[host].affine[1]
-        return View(frames[other].target, T, torch.stack([a, b]))
-
-    def _project(self, place: int) -> tuple[Int64[Tensor, "N"], Tensor, Tensor, Bool[Tensor, "N"]]:
-        """Return all points in one keyframe: pixel, unit ray, inverse distance, and whether they look alike there."""
-        points, frames = self.window.points, self.window.frames
-        assert points is not None
-        camera, T_cam_world = self.builder.cameras[0], frames[place].T_cam_world
-        T_host_world = torch.stack([frame.T_cam_world for frame in frames])
-        T = (T_cam_world @ lie.se3_inverse(T_host_world)).to(points.rho)[points.host]
-        centre = CENTRE if points.ray.shape[2] > 1 else 0
-        Y = torch.einsum("nij,jn->in", T[:, :3, :3], points.ray[..., centre]) + points.rho * T[:, :3, 3].T
-        inv_length = Y.square().sum(0).clamp_min(1e-24).rsqrt()
-        ray, rho = Y * inv_length, points.rho * inv_length
-        uv, seen = camera.project(ray.T)
-        column = uv[:, 0].long().clamp(0, camera.width - 1)
-        row = uv[:, 1].long().clamp(0, camera.height - 1)
-        affine = torch.stack([frame.affine for frame in frames]).to(points.rho)[points.host]
-        scene = (points.value[:, centre] - affine[:, 1]) * (-affine[:, 0]).exp()
-        own = frames[place].affine.to(points.rho)
-        expected = own[0].exp() * scene + own[1]
-        alike = (self.frames[place].value(ray) - expected).abs() < self.config.map.max_difference
-        return row * camera.width + column, ray, rho, seen & alike & (points.weight[:, centre] > 0)
+    def _free(self, pixel: Int64[Tensor, "N"], place: int) -> Bool[Tensor, "N"]:
+        """Return which pixels of a keyframe lie in cells that are not crowded with the map's points already."""
+        points = self.window.points
+        if points is None:
+            return torch.ones_like(pixel, dtype=torch.bool)
+        seen = project_points(points, self.window.frames, place, self.config.map.max_difference)
+        cell = equal_area_cells(self.builder.cameras[0], self.config.map.points, device=pixel.device).flatten()
+        crowd = torch.bincount(cell[seen.pixel[seen.shown]], minlength=int(cell.max()) + 1)
+        return crowd[cell[pixel]] < self.config.window.keyframes
 
     def reference(self, place: int = -1) -> Keyframe:
         """Return the window's points as one keyframe sees them: what the next frames are tracked against."""
         place %= len(self.frames)
         points, frame = self.window.points, self.frames[place]
         assert points is not None
-        pixel, ray, rho, ok = self._project(place)
+        pixel, ray, rho, shown = project_points(points, self.window.frames, place, self.config.map.max_difference)
         variance = self.config.track.noise**2 / points.curvature.clamp_min(1e-9)
         variance = variance * (rho / points.rho.clamp_min(1e-6)) ** 4
-        index = ok.nonzero()[:, 0]
+        index = shown.nonzero()[:, 0]
         index = index[pixel[index].argsort(stable=True)]
         ray, rho = ray[:, index].contiguous(), rho[index]
         self._shown = index

@@ -3,6 +3,7 @@
 from torchvo360.window.config import WindowConfig
 from torchvo360.window.pattern import CENTRE, PATTERN, pattern_rays
 from torchvo360.window.points import WindowPoints, make_points
+from torchvo360.window.projection import Projected, project_points
 from torchvo360.window.state import WindowFrame
 from torchvo360.window.trace import TraceConfig, View, trace
 from torchvo360.window.window import Adjustment, Window
@@ -11,6 +12,7 @@ __all__ = [
     "CENTRE",
     "PATTERN",
     "Adjustment",
+    "Projected",
     "TraceConfig",
     "View",
     "Window",
@@ -19,5 +21,6 @@ __all__ = [
     "WindowPoints",
     "make_points",
     "pattern_rays",
+    "project_points",
     "trace",
 ]

@@ -102,7 +102,13 @@ def run(config: RunConfig, *, config_yaml: str = "") -> Outcome:
     ):
         depth = None if depth is None else depth.to(config.device)
         odometry = VisualOdometry(
-            sequence.camera, config.vo, mask=mask, depth=depth, seed=config.seed, device=config.device
+            sequence.camera,
+            config.vo,
+            mask=mask,
+            depth=depth,
+            seed=config.seed,
+            device=config.device,
+            rig=getattr(sequence, "rig", None),
         )
         journey = _step_through(sequence, odometry, truth, stop, config.progress)
         if journey.usable < 2 and stop.received:

@@ -187,6 +187,47 @@ def test_a_third_map_is_placed_by_a_second_that_has_been_placed():
     torch.testing.assert_close(atlas.S_world_map[2], S_third)
 
 
+@pytest.mark.parametrize("by", [1, 2], ids=["by_itself", "by_its_companion"])
+def test_maps_that_are_joined_move_together(by):
+    """A second and a third map know each other; once either is seen from the first, both are placed."""
+    atlas, true = two_maps()
+    S = [EYE, S_SECOND, similarity(0.4, -1.0, 0.0, 2.0, 0.0, -1.0, 0.2)]
+    third = {20 + k: seen_from(S[2], T) for k, T in enumerate(true[5:8])}
+    atlas.begin(Keys(third))
+    poses = {**atlas.sessions[0].mapper.poses(), **atlas.sessions[1].mapper.poses(), **third}
+
+    def seen(i: int, j: int) -> LoopEdge:
+        (S_i, S_j) = (S[min(key // 10, 2)] @ poses[key] for key in (i, j))
+        return edge(i, j, lie.sim3_inverse(S_j) @ S_i)
+
+    assert atlas.join(seen(14, 20))
+    assert atlas.join(seen(3, 15 if by == 1 else 21))
+    for placed, expected in zip(atlas.S_world_map, S, strict=True):
+        torch.testing.assert_close(placed, expected)
+
+
+def test_a_map_that_has_its_place_is_not_torn_off_by_one_that_has_none():
+    atlas, true = two_maps()
+    S_third = similarity(0.4, -1.0, 0.0, 2.0, 0.0, -1.0, 0.2)
+    atlas.begin(Keys({20: seen_from(S_third, true[5])}))
+    poses = {key: T for session in atlas.sessions for key, T in session.mapper.poses().items()}
+    third, second = S_third @ poses[20], S_SECOND @ poses[14]
+    atlas.join(edge(3, 20, lie.sim3_inverse(third) @ poses[3]))
+    atlas.join(edge(14, 20, lie.sim3_inverse(third) @ second))
+    torch.testing.assert_close(atlas.S_world_map[2], S_third)
+    torch.testing.assert_close(atlas.S_world_map[1], S_SECOND)
+
+
+def test_maps_of_one_keyframe_each_are_corrected_too():
+    atlas = Atlas()
+    atlas.begin(Keys({0: EYE}))
+    atlas.begin(Keys({5: EYE}))
+    loop = edge(0, 5, similarity(2.0, 0.0, 0.0, 1.0, 0.0, 0.1, 0.0))
+    assert atlas.join(loop)
+    after = atlas.corrected([loop], CONFIG)
+    torch.testing.assert_close(after[5], lie.sim3_inverse(loop.S_j_i))
+
+
 def test_a_loop_within_a_map_joins_nothing():
     atlas, _ = two_maps()
     assert not atlas.join(edge(0, 9, EYE))

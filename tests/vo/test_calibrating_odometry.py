@@ -42,3 +42,17 @@ def test_a_pinhole_two_percent_off_is_put_right(world):
     # Measured: focal lengths 0.27 % off at most, the centre 0.04 %; a window from the truth reaches 0.1 % and 0.03 %.
     assert float(error[[2, 3]].abs().max()) < 0.1
     assert float(error[:2].abs().max()) < 0.5
+
+
+def test_a_map_that_is_taken_back_leaves_no_intrinsics_behind():
+    """A start that is lost before it is confirmed was a wrong one, and so are the intrinsics it led to."""
+    sequence = SyntheticSequence(SyntheticConfig(width=256, height=128, frames=1))
+    odometry = VisualOdometry(sequence.camera, OdometryConfig(window=WindowConfig(calibrate=True)))
+    given = sequence.frame(0)
+    assert given.image is not None
+    fx, fy, cx, cy = sequence.camera.intrinsics
+    builder = odometry._builder
+    builder.recalibrate(torch.tensor([fx, 1.1 * fy, cx, cy], dtype=torch.float64))
+    frame = odometry._as_before(builder.build(given.image, 0, 0))
+    assert frame.targets[0].camera.intrinsics == pytest.approx((fx, fy, cx, cy))
+    assert builder.cameras[0].intrinsics == pytest.approx((fx, fy, cx, cy))

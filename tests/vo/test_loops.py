@@ -75,6 +75,20 @@ def test_a_place_seen_again_gives_the_similarity_between_the_two_maps(room, firs
     assert bool((torch.linalg.eigvalsh(edges[0].information) > 0).all())
 
 
+def test_a_place_is_known_again_after_the_intrinsics_have_been_estimated_anew(first):
+    """Keyframes of before were built with other cameras; their points keep their pixels."""
+    place = Place("room", 1)
+    closer = place.closer(min_gap=1)
+    closer.add(first)
+    closer.add(place.key(1, place.pose(45)))
+    fx, fy, cx, cy = CAMERA.intrinsics
+    place.builder.recalibrate(torch.tensor([fx, 1.005 * fy, cx, cy + 0.2], dtype=torch.float64))
+    edges = closer.add(place.key(7, place.pose(0, yaw=1.0)))
+    assert [(edge.i, edge.j) for edge in edges] == [(0, 7)]
+    S = edges[0].S_j_i
+    assert float(torch.linalg.det(S[:3, :3]).pow(1 / 3)) == pytest.approx(1.0, abs=0.02)
+
+
 def test_the_last_few_before_a_keyframe_are_not_compared_with_it(room):
     closer = room.closer(min_gap=3)
     for index in range(5):

@@ -35,6 +35,21 @@ def test_eliminating_a_keyframe_keeps_the_others_solution(place, shared):
     assert torch.equal(A, A.T)
 
 
+@pytest.mark.parametrize("rounding", [0.0, 1e-14, -1e-14, -1e-11])
+def test_an_unknown_of_no_curvature_takes_nothing_of_the_rest_with_it(rounding):
+    """As with a brightness that no point tells: what is left of it after the points' elimination may be negative."""
+    size = 2 * PER_FRAME
+    H, g = spd(size, 3), torch.randn(size, dtype=torch.float64, generator=torch.Generator().manual_seed(5))
+    others = torch.arange(size) != 6
+    without = H[others][:, others]
+    H[6], H[:, 6] = 0.0, 0.0
+    H[6, 6] = rounding
+    A, _ = eliminate_frame(H, g, 0)
+    gone = PER_FRAME - 1
+    carried = without[gone:, :gone] @ torch.linalg.solve(without[:gone, :gone], without[:gone, gone:])
+    torch.testing.assert_close(A, without[gone:, gone:] - carried)
+
+
 def test_a_keyframe_nothing_is_known_of_carries_nothing_over():
     H, g = torch.zeros(24, 24, dtype=torch.float64), torch.zeros(24, dtype=torch.float64)
     stay = torch.cat([torch.arange(8), torch.arange(16, 24)])

@@ -28,9 +28,9 @@ class FilterConfig:
     outlier_inflation: float = 1.5
     """Growth of the variance with an outlier."""
     variance_floor: float = 2e-3
-    """Least relative variance V / rho^2 a point keeps when it is carried to a new keyframe."""
+    """Least relative variance V / rho^2 a point keeps when it is carried over to a frame found in its keyframe."""
     smoothing: float = 0.3
-    """Share by which a point moves towards the mean of consistent neighbours at a keyframe change; 0 leaves it."""
+    """Share by which a point moves towards the mean of consistent neighbours at a start; 0 leaves it."""
     radius_px: int = 2
     """Neighbours are points within this many pixels in both directions."""
     max_score: float = 8.0

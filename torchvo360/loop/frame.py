@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Bool, Float, Float64, UInt8
@@ -63,6 +63,18 @@ class LoopFrame:
             confidence = pad_image(known.to(image)[None, None], camera, 1).contiguous()
         padded = pad_image(image[None, None], camera, 1).contiguous()
         return Target(camera, padded, confidence, self.saturation if blur_px == 0 else None)
+
+    def recalibrated(self, cameras: tuple[Camera, ...]) -> LoopFrame:
+        """Return the frame with other intrinsics: its points keep their pixels and ranges, and their rays turn.
+
+        Args:
+            cameras: Of each level, of the same sizes.
+        """
+        if cameras == self.cameras:
+            return self
+        uv, _ = self.cameras[0].project(self.ray.T)
+        ray = cameras[0].ray(uv).T
+        return replace(self, cameras=cameras, ray=(ray / torch.linalg.vector_norm(ray, dim=0)).contiguous())
 
     def points(self, target: Target, most: int) -> Reference:
         """Return at most `most` of the points, evenly thinned, with their values in this frame's own level."""

@@ -46,12 +46,15 @@ class Atlas:
     sessions: list[Session] = field(default_factory=list)
     """The newest last."""
     S_world_map: list[Float64[Tensor, "4 4"]] = field(default_factory=list)
+    oldest: list[int] = field(default_factory=list)
+    """By map: the oldest one of those it is joined with."""
 
     def begin(self, mapper: Mapper, *, map: int | None = None, after: int | None = None) -> None:
         """Begin a session: on an earlier map, after one of its keyframes, or on a new one."""
         if map is None:
             map = len(self.S_world_map)
             self.S_world_map.append(torch.eye(4, dtype=torch.float64))
+            self.oldest.append(map)
         self.sessions.append(Session(map, after, mapper))
 
     def drop_session(self) -> None:
@@ -59,6 +62,7 @@ class Atlas:
         gone = self.sessions.pop()
         if all(session.map != gone.map for session in self.sessions):
             self.S_world_map.pop()
+            self.oldest.pop()
 
     def map_of(self, key: int) -> int:
         """Return the map that a keyframe belongs to."""
@@ -81,19 +85,26 @@ class Atlas:
                 self.estimates[at] = replace(estimate, **UNMEASURED)
 
     def join(self, edge: LoopEdge) -> bool:
-        """Place the newer of the two maps that a loop connects; False where it connects a map with itself."""
+        """Place the newer of the two maps that a loop connects, and with it all maps that it is joined with.
+
+        The newer is the one whose oldest companion began later: what is joined with the first map stays. False where
+        the loop connects a map with itself, or maps that are joined already: such loops wait for the pose graph.
+        """
         map_i, map_j = self.map_of(edge.i), self.map_of(edge.j)
-        if map_i == map_j:
+        if map_i == map_j or self.oldest[map_i] == self.oldest[map_j]:
             return False
         poses = self._in_maps()
         # X_world = S_world_i X_i, and X_i = S_j_i^-1 X_j: what j's keyframe sees is where i's says.
-        S_i_j = lie.sim3_inverse(edge.S_j_i)
-        if map_j > map_i:
-            placed = self.S_world_map[map_i] @ poses[edge.i] @ S_i_j @ lie.se3_inverse(poses[edge.j])
-            self.S_world_map[map_j] = placed
-        else:
-            placed = self.S_world_map[map_j] @ poses[edge.j] @ edge.S_j_i @ lie.se3_inverse(poses[edge.i])
-            self.S_world_map[map_i] = placed
+        newer, older, S_older_newer = map_j, map_i, poses[edge.i] @ lie.sim3_inverse(poses[edge.j] @ edge.S_j_i)
+        if (self.oldest[map_i], map_i) > (self.oldest[map_j], map_j):
+            newer, older, S_older_newer = map_i, map_j, lie.sim3_inverse(S_older_newer)
+        placed = self.S_world_map[older] @ S_older_newer
+        moved, group = placed @ lie.sim3_inverse(self.S_world_map[newer]), self.oldest[newer]
+        self.S_world_map[newer] = placed
+        for map in (at for at, oldest in enumerate(self.oldest) if oldest == group):
+            if map != newer:
+                self.S_world_map[map] = moved @ self.S_world_map[map]
+            self.oldest[map] = self.oldest[older]
         return True
 
     def keyframes(self) -> dict[int, Float64[Tensor, "4 4"]]:
@@ -123,7 +134,9 @@ class Atlas:
             if session.after is not None and keys:
                 chain.append((session.after, keys[0]))
             chain += list(pairwise(keys))
-        S_chain = torch.stack([lie.se3_inverse(poses[j]) @ poses[i] for i, j in chain])
+        # Maps of one keyframe each have no chain.
+        none = torch.zeros(0, 4, 4, dtype=torch.float64)
+        S_chain = torch.cat([none, *((lie.se3_inverse(poses[j]) @ poses[i])[None] for i, j in chain)])
         sigma = {"scale_sigma": METRIC_SCALE_SIGMA} if metric else {}
         graph = PoseGraph(
             S_world_key=torch.stack(list(nodes.values())),

@@ -1,4 +1,4 @@
-"""The hand-over from one keyframe to the next: the same points go on, at their exact places."""
+"""The hand-over from an old keyframe to a frame found in it: the same points go on, at their exact places."""
 
 from dataclasses import dataclass
 from typing import Self

@@ -1,4 +1,4 @@
-"""Keyframes: a frame with points whose inverse ranges the filter keeps improving."""
+"""Keyframes: frames with points and what is known of their inverse ranges."""
 
 from dataclasses import dataclass
 
@@ -19,9 +19,9 @@ class MapConfig:
     """Settings of keyframes and their points."""
 
     points: int = 800
-    """Equal-area cells over the whole sphere, in each of which a new keyframe has at most one new point."""
+    """Fresh points that a keyframe looks for, one in each equal-area cell: the cells shrink where many give none."""
     start_points: int = 6000
-    """Cells of a first keyframe, each with at most one point, before its ranges are known."""
+    """Cells of the first keyframe of a window, each with at most one point, before its ranges are known."""
     min_gradient: float = 4 / 255
     """Least gradient of a point, intensity per pixel."""
     max_difference: float = 15 / 255
@@ -92,7 +92,7 @@ class KeyPoints:
 
 @dataclass
 class Keyframe(KeyPoints):
-    """Points with the frame they were chosen in, which the epipolar search compares with."""
+    """Points with the frame they are seen in."""
 
     frame: PyramidFrame
 
@@ -104,7 +104,7 @@ def make_keyframe(
     config: MapConfig,
     carried: CarriedPoints | None = None,
 ) -> Keyframe:
-    """Choose a frame's points: those carried over from the last keyframe, and new ones where they leave a cell empty.
+    """Choose a frame's points: those carried over from an older keyframe, and new ones in empty cells.
 
     New points' inverse ranges are guesses, with score 0: rho 1 and variance 1 without carried points.
     """

@@ -94,7 +94,9 @@ class LoopCloser:
     def _search(self, index: int, place: LoopFrame, descriptor: Tensor, skip: int) -> list[LoopEdge]:
         out = []
         for candidate in self._index.query(descriptor, skip_newest=skip, count=self._config.tried):
-            result = verify_loop(self._frames[candidate.key_id], place, self._config.verify)
+            # Where intrinsics are estimated, the newest know them best.
+            earlier = self._frames[candidate.key_id].recalibrated(place.cameras)
+            result = verify_loop(earlier, place, self._config.verify)
             if result.accepted:
                 out.append(LoopEdge(candidate.key_id, index, result.S_b_a, result.information))
         return out

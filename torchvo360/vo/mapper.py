@@ -22,10 +22,6 @@ START_STEPS = 15
 """Steps of the first adjustment of a start."""
 
 
-def _identity() -> Float64[Tensor, "4 4"]:
-    return torch.eye(4, dtype=torch.float64)
-
-
 @dataclass
 class Mapper:
     """Keyframes in the window, the newest last, and the tracking reference that they make together."""

@@ -42,7 +42,9 @@ def track_pending(
         if found is not None and found.inliers >= config.weak_inliers:
             known[frame.index], brightness = found.T_cam_key, found.affine
     before = max(known)
-    since = lie.se3_log(guesses[newest] @ lie.se3_inverse(known[before])) / (newest - before)
+    # Frames, not numbers: of a video only every so many may be given.
+    count = max(1, sum(before < index <= newest for index in rotations))
+    since = lie.se3_log(guesses[newest] @ lie.se3_inverse(known[before])) / count
     return {**known, newest: guesses[newest]}, lie.se3_exp(since)
 
 

@@ -35,6 +35,7 @@ from torchvo360.vo.recover import Recovery
 from torchvo360.vo.state import FrameEstimate, State
 from torchvo360.vo.stereo import StereoRanges, check_others, check_rig
 from torchvo360.vo.track import Track
+from torchvo360.window.calibration import intrinsics_of
 
 
 @dataclass(frozen=True)
@@ -110,7 +111,7 @@ class VisualOdometry:
         self._starter = Starter(self._builder, config, torch.Generator().manual_seed(seed), learned, stereo)
         self._atlas = Atlas()
         self._follower: Follower | None = None
-        self._remembered_before = 0
+        self._remembered_before, self._cameras_before = 0, self._builder.cameras
         self._lost = 0
 
     def step(self, frame: Frame) -> FrameEstimate:
@@ -200,7 +201,7 @@ class VisualOdometry:
         else:
             atlas.begin(begun.mapper)
         atlas.fill_in(begun.key, begun.T_key_cam)
-        self._remembered_before = len(self._recovery)
+        self._remembered_before, self._cameras_before = len(self._recovery), self._builder.cameras
         for key in begun.mapper.references()[:-1]:
             self._recovery.remember(key)
         self._follow_on(begun.mapper, begun.newest, frame, begun.motion)
@@ -242,7 +243,8 @@ class VisualOdometry:
         reason = f"bad_frame_{frame.problem or 'unreadable'}"
         if self._follower is not None:
             self._follower.predict(frame.index)
-            return _estimate(frame, self._atlas.in_world(self._follower.T_map_cam), State.WEAK, reason, None)
+            state = State.LOST if self._lost else State.WEAK
+            return _estimate(frame, self._atlas.in_world(self._follower.T_map_cam), state, reason, None)
         last = self._atlas.estimates[-1].T_world_cam if self._atlas.estimates else torch.eye(4, dtype=torch.float64)
         return _estimate(frame, last, self._waiting, reason, None)
 
@@ -250,16 +252,16 @@ class VisualOdometry:
 
     def _lose(self, follower: Follower, frame: PyramidFrame) -> FrameEstimate:
         if self._starter.settling and not follower.mapper.settled:
-            # The network misjudged its only keyframe: the corners have to do without.
+            # The network misjudged its first keyframes: the corners have to do without.
             self._forget_map()
-            return self._begin(frame)
+            return self._begin(self._as_before(frame))
         if self._starter.confirming:
             # Lost before the start was confirmed: a wrong start ends so, and nothing may be found again in its map.
             T_world_cam = self._atlas.in_world(follower.T_map_cam)
             unit = follower.median_rho()
             self._forget_map()
             self._starter.restart(T_world_cam, unit)
-            return self._begin(frame)
+            return self._begin(self._as_before(frame))
         self._starter.rest()
         self._lost += 1
         found = self._relocalised(frame)
@@ -282,6 +284,13 @@ class VisualOdometry:
         self._loops.forget(set(self._atlas.sessions[-1].mapper.poses()))
         self._atlas.drop_session()
         self._follower = None
+
+    def _as_before(self, frame: PyramidFrame) -> PyramidFrame:
+        """Return a frame with the intrinsics that held before a map that was taken back, and hold to them."""
+        if not self.config.window.calibrate:
+            return frame
+        self._builder.recalibrate(intrinsics_of(self._cameras_before[0]))
+        return self._builder.recalibrated(frame)
 
     def _relocalised(self, frame: PyramidFrame) -> FrameEstimate | None:
         """Look for a frame in the earlier keyframes, and go on from where it is found."""

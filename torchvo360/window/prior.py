@@ -8,6 +8,7 @@ from torch import Tensor
 
 from torchvo360 import lie
 from torchvo360.window.state import PER_FRAME, POSE, Estimate, WindowFrame
+from torchvo360.window.system import LEAST_CURVATURE
 
 
 @dataclass(frozen=True)
@@ -60,7 +61,9 @@ def eliminate_frame(
     gone = torch.zeros(len(g), dtype=torch.bool, device=g.device)
     gone[place * PER_FRAME : (place + 1) * PER_FRAME] = True
     block = H[gone][:, gone]
-    scale = block.diagonal().clamp_min(torch.finfo(H.dtype).tiny).rsqrt()
+    # Rounding leaves a curvature of nothing a little below zero: scaled up, it would drown all that is known.
+    diagonal = block.diagonal()
+    scale = torch.where(diagonal > LEAST_CURVATURE, diagonal.clamp_min(LEAST_CURVATURE).rsqrt(), 0.0)
     inverse = torch.linalg.pinv(scale[:, None] * block * scale, hermitian=True, rtol=1e-9)
     inverse = scale[:, None] * inverse * scale
     carried = H[~gone][:, gone] @ inverse

@@ -32,7 +32,7 @@ class TraceConfig:
     """Settings of tracing new points."""
 
     reach_px: int = 128
-    """Pixels of arc from infinity that are searched, at a width of 1024; it grows and shrinks with the image."""
+    """Pixels of arc from infinity that are searched, at a width of 1024; it grows and shrinks with a panorama's."""
     candidates: int = 4
     """Places along the curve that are compared through the whole pattern."""
     views: int = 2

@@ -185,6 +185,20 @@ class Starter:
         eye = torch.eye(4, dtype=torch.float64)
         return Begun(mapper, key, eye, frame.index, {}, measure_keyframe(key, self._config.track, limit), LEARNED)
 
+    def _between(self, start: Start, frame: PyramidFrame) -> list[PyramidFrame]:
+        """Return a frame about half way to the newest, by distance, where a start has placed one.
+
+        What moves by itself can pass for still in two images, hardly in three; a third without parallax says nothing.
+        """
+        way = float(torch.linalg.vector_norm(start.T_cam_key[frame.index][:3, 3]))
+        share = {
+            f.index: float(torch.linalg.vector_norm(start.T_cam_key[f.index][:3, 3])) / max(way, 1e-12)
+            for f in self._corners.pending
+            if f.index in start.T_cam_key
+        }
+        half_way = [f for f in self._corners.pending if abs(share.get(f.index, 0.0) - 0.5) < 0.25]
+        return sorted(half_way, key=lambda f: abs(share[f.index] - 0.5))[:1]
+
     def _by_corners(self, start: Start, frame: PyramidFrame, reason: str) -> Begun:
         """Take over a start: adjust it, and find the frames that waited for it."""
         # A new map after a loss takes the old one's unit by its median range, unless a network knows the metre.
@@ -192,10 +206,8 @@ class Starter:
         start = start.rescaled(self._unit if unit is None else unit)
         start.key.T_world_key = self._T_world_ref
         mapper = Mapper.begun(start.key, self._builder, self._config, known=False)
-        placed = sorted((f for f in self._corners.pending if f.index in start.T_cam_key), key=lambda f: f.index)
         T_key_world = lie.se3_inverse(start.key.T_world_key)
-        # One frame between, where there is one: what moves by itself can pass for still in two images, hardly in three.
-        chosen = [*placed[: len(placed) // 2][-1:], frame] if len(placed) > 1 else [frame]
+        chosen = [*self._between(start, frame), frame]
         mapper.open([(f, start.T_cam_key[f.index] @ T_key_world, start.affine[f.index]) for f in chosen])
         first, newest = mapper.reference(0), mapper.reference()
         waiting, earlier = self._corners.pending, self._earlier

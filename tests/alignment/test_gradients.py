@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import pytest
 import torch
-from conftest import CASES, TIGHT, Layer, probe
+from probes import CASES, TIGHT, Layer, probe
 from torch import Tensor
 
 from torchvo360 import AlignConfig, AlignResult, Status, lie

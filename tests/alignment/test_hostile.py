@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import pytest
 import torch
-from conftest import CASES, TIGHT, probe
+from probes import CASES, TIGHT, probe
 from torch.func import grad, vmap
 
 from torchvo360 import Align, AlignConfig, Equirectangular, Status, align

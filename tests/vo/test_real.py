@@ -78,8 +78,9 @@ def test_the_whole_walk_is_followed_to_its_end_in_one_scale(shared):
     def scale(part: slice) -> float:
         return evaluate(Trajectory(estimate.t_ns[part], estimate.T_world_cam[part]), other).scale
 
-    assert scale(slice(-300, None)) == pytest.approx(scale(slice(0, 300)), rel=0.1)
-    assert evaluate(estimate, other).ate_percent < 1.0
+    # The other's first quarter is 5 to 7 % off this one's, forwards and in reverse alike: it is no exact ruler.
+    assert scale(slice(-300, None)) == pytest.approx(scale(slice(0, 300)), rel=0.12)
+    assert evaluate(estimate, other).ate_percent < 0.5
 
 
 @pytest.mark.slow

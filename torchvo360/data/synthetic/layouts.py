@@ -12,7 +12,8 @@ from torchvo360.data.synthetic.surfaces import Lamp
 from torchvo360.data.synthetic.texture import HEIGHT, WIDTH
 from torchvo360.data.synthetic.world import Walkway, World
 
-WORLDS = ("room", "pillars", "courtyard", "field")
+WORLDS = ("room", "pillars", "courtyard")
+FIELD = "field"
 
 
 def make_world(name: str, *, seed: int = 0, panorama: str | Path | None = None, moving_objects: int = 0) -> World:
@@ -30,7 +31,7 @@ def make_world(name: str, *, seed: int = 0, panorama: str | Path | None = None, 
     Raises:
         InputError: The name is another one, or the panorama cannot be read.
     """
-    check_choice("world", name, WORLDS)
+    check_choice("world", name, (*WORLDS, FIELD))
     generator = torch.Generator().manual_seed(seed)
     image = None if panorama is None else _read_panorama(Path(panorama))
     makers = {"room": _room, "pillars": _pillars, "courtyard": _courtyard, "field": _field}

@@ -13,7 +13,7 @@ from torchvo360.cameras import Camera, Equirectangular, Pinhole, Rig
 from torchvo360.checks import InputError, check_choice, check_finite_number
 from torchvo360.data.frame import Frame
 from torchvo360.data.synthetic.companion import MOST_SHARE, with_companion
-from torchvo360.data.synthetic.layouts import WORLDS, make_world
+from torchvo360.data.synthetic.layouts import FIELD, WORLDS, make_world
 from torchvo360.data.synthetic.motion import MOTIONS, trajectory
 from torchvo360.data.synthetic.rays import CameraRays
 from torchvo360.data.trajectory import Trajectory
@@ -73,7 +73,7 @@ class SyntheticConfig:
     """Path of an equirectangular image that the walls wear, or the sky of the courtyard; None for procedural looks."""
 
     def __post_init__(self) -> None:
-        check_choice("world", self.world, WORLDS)
+        check_choice("world", self.world, (*WORLDS, FIELD))
         check_choice("camera", self.camera, CAMERAS)
         check_choice("motion", self.motion, MOTIONS)
         check_choice("exposure", self.exposure, EXPOSURES)

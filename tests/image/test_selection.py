@@ -7,7 +7,7 @@ import torch
 
 from torchvo360.cameras import Equirectangular, Pinhole
 from torchvo360.checks import ShapeError
-from torchvo360.image import equal_area_cells, select_pixels
+from torchvo360.image import equal_area_cells, one_per_cell, select_pixels
 
 SPHERE = Equirectangular(512, 256)
 PLANE = Pinhole(160, 120, 90.0, 85.0, 78.0, 61.5)
@@ -73,3 +73,9 @@ def test_ties_go_to_the_first_pixel():
 def test_bad_input_is_named():
     with pytest.raises(ShapeError, match=r"^usable: expected shape \[256 512\], got \[256, 511\]\.$"):
         select_pixels(noise(SPHERE), torch.ones(256, 511, dtype=torch.bool), SPHERE, 10, minimum=0.0)
+
+
+def test_each_cell_gives_its_cheapest_element_and_of_equals_the_first():
+    cell, cost = torch.tensor([2, 0, 2, 0, 2, 5]), torch.tensor([3.0, 1.0, 1.0, 1.0, 1.0, 9.0])
+    assert one_per_cell(cell, cost).tolist() == [1, 2, 5]
+    assert one_per_cell(cell[:0], cost[:0]).tolist() == []

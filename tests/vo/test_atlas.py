@@ -12,7 +12,7 @@ from torchvo360 import lie
 from torchvo360.loop import PoseGraphConfig, carry_poses
 from torchvo360.vo import FrameEstimate, State
 from torchvo360.vo.atlas import Atlas
-from torchvo360.vo.cloud import PointCloud
+from torchvo360.vo.keyframes.cloud import PointCloud
 from torchvo360.vo.loops import LoopEdge
 
 EYE = torch.eye(4, dtype=torch.float64)

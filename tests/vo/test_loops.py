@@ -16,7 +16,7 @@ from torchvo360.depth import InverseRange
 from torchvo360.evaluation import evaluate
 from torchvo360.vo import OdometryConfig, State, VisualOdometry
 from torchvo360.vo.frame import FrameBuilder
-from torchvo360.vo.keyframe import Keyframe, MapConfig, make_keyframe
+from torchvo360.vo.keyframes.keyframe import Keyframe, MapConfig, make_keyframe
 from torchvo360.vo.loops import LoopCloser, LoopConfig
 
 CAMERA = Equirectangular(256, 128)

@@ -15,7 +15,7 @@ from torchvo360.data.synthetic import SyntheticConfig, SyntheticSequence
 from torchvo360.depth import InverseRange
 from torchvo360.vo import OdometryConfig
 from torchvo360.vo.frame import FrameBuilder, PyramidFrame
-from torchvo360.vo.keyframe import Keyframe, make_keyframe
+from torchvo360.vo.keyframes.keyframe import Keyframe, make_keyframe
 from torchvo360.vo.recover import TRIED_PER_FRAME, Recovery
 
 CAMERA = Equirectangular(256, 128)

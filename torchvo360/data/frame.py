@@ -5,10 +5,12 @@ from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
-from jaxtyping import UInt8
+from jaxtyping import Bool, Float32, UInt8
+from torch import Tensor
 
-from torchvo360.cameras import Camera
+from torchvo360.cameras import Camera, Rig
 from torchvo360.data.trajectory import Trajectory
+from torchvo360.inertial import ImuSensor
 
 
 @dataclass(frozen=True)
@@ -26,10 +28,13 @@ class Frame:
     others: tuple[UInt8[np.ndarray, "H W 3"] | None, ...] = ()
     """Images of a rig's further cameras at the same time, in the rig's order, None for one that is missing; empty for a
     single camera."""
+    depth: Float32[np.ndarray, "H W"] | None = None
+    """A depth sensor's range of every pixel in the camera's measure (z for a pinhole, the distance for a panorama),
+    metres; 0 or not finite where it is not known. None without a sensor."""
 
 
 class ImageSequence(Protocol):
-    """Frames in time order, all from one camera."""
+    """Frames in time order, all from one camera; a class that inherits it may leave out what it has not."""
 
     @property
     def name(self) -> str:
@@ -49,6 +54,26 @@ class ImageSequence(Protocol):
     @property
     def truth(self) -> Trajectory | None:
         """The true poses, where they are known."""
-        ...
+        return None
+
+    @property
+    def notes(self) -> list[str]:
+        """Sentences for the user, complete once the sequence has been iterated."""
+        return []
+
+    @property
+    def mask(self) -> Bool[Tensor, "H W"] | None:
+        """The pixels that show something, where not all do, such as those beyond a lens's view."""
+        return None
+
+    @property
+    def rig(self) -> Rig | None:
+        """The cameras whose images the frames bring, this one first; None for a single camera."""
+        return None
+
+    @property
+    def imu(self) -> ImuSensor | None:
+        """The inertial measurements of the same time, where there are any."""
+        return None
 
     def __iter__(self) -> Iterator[Frame]: ...

@@ -4,7 +4,7 @@ from torchvo360.image.covector import covector_field, gradient, gradient_magnitu
 from torchvo360.image.padding import pad_image
 from torchvo360.image.pyramid import blur, blur_radius, level_camera, masked_pyramid, pyramid, resample
 from torchvo360.image.sampling import Interpolated, Taps, interpolate, locate, sample
-from torchvo360.image.selection import equal_area_cells, select_about, select_pixels
+from torchvo360.image.selection import equal_area_cells, one_per_cell, select_about, select_pixels
 
 __all__ = [
     "Interpolated",
@@ -19,6 +19,7 @@ __all__ = [
     "level_camera",
     "locate",
     "masked_pyramid",
+    "one_per_cell",
     "pad_image",
     "pyramid",
     "resample",

@@ -63,6 +63,15 @@ def select_pixels(
     return best[lowest[cell[best]] == best]
 
 
+def one_per_cell(cell: Int64[Tensor, "N"], cost: Float[Tensor, "N"]) -> Int64[Tensor, "M"]:
+    """Return the index of the cheapest element of each cell, by increasing cell; of equals the first."""
+    by_cost = cost.argsort(stable=True)
+    order = by_cost[cell[by_cost].argsort(stable=True)]
+    first = torch.ones_like(order, dtype=torch.bool)
+    first[1:] = cell[order][1:] != cell[order][:-1]
+    return order[first]
+
+
 MOST_CELLS = 4
 """The number of cells grows at most by this factor to make up for those without a usable pixel."""
 

@@ -1,8 +1,8 @@
 """Visual odometry: from frames to poses and a map."""
 
-from torchvo360.vo.begin import LEARNED, STEREO
-from torchvo360.vo.cloud import PointCloud
 from torchvo360.vo.config import OdometryConfig
+from torchvo360.vo.keyframes.cloud import PointCloud
+from torchvo360.vo.start.begin import LEARNED, STEREO
 from torchvo360.vo.state import FrameEstimate, State
 from torchvo360.vo.system import OdometryResult, VisualOdometry
 

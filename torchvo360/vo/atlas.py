@@ -16,9 +16,9 @@ from torch import Tensor
 
 from torchvo360 import lie
 from torchvo360.loop import PoseGraph, PoseGraphConfig, carry_poses, odometry_information, optimise_pose_graph
-from torchvo360.vo.cloud import PointCloud, join_clouds
+from torchvo360.vo.keyframes.cloud import PointCloud, join_clouds
+from torchvo360.vo.keyframes.mapper import Mapper
 from torchvo360.vo.loops import LoopEdge
-from torchvo360.vo.mapper import Mapper
 from torchvo360.vo.state import FrameEstimate
 
 UNMEASURED = {"residual": math.nan, "inliers": math.nan, "a": math.nan, "b": math.nan}

@@ -4,9 +4,9 @@ from dataclasses import dataclass, field
 
 from torchvo360.checks import InputError, check_finite_number
 from torchvo360.depth import EpipolarConfig, FilterConfig
-from torchvo360.vo.initialise import InitialiseConfig
-from torchvo360.vo.keyframe import MapConfig
+from torchvo360.vo.keyframes.keyframe import MapConfig
 from torchvo360.vo.loops import LoopConfig
+from torchvo360.vo.start.initialise import InitialiseConfig
 from torchvo360.vo.track import TrackConfig
 from torchvo360.window import TraceConfig, WindowConfig
 

@@ -8,12 +8,10 @@ from jaxtyping import Float64
 from torch import Tensor
 
 from torchvo360 import lie
-from torchvo360.depth import InverseRange
-from torchvo360.vo.carry import CarriedPoints
 from torchvo360.vo.config import OdometryConfig
 from torchvo360.vo.frame import FrameBuilder, PyramidFrame
-from torchvo360.vo.keyframe import Keyframe, KeyPoints, make_keyframe
-from torchvo360.vo.mapper import Mapper
+from torchvo360.vo.keyframes.keyframe import Keyframe, KeyPoints
+from torchvo360.vo.keyframes.mapper import Mapper
 from torchvo360.vo.recover import Recovery
 from torchvo360.vo.track import Track, judge_points, track
 
@@ -164,26 +162,3 @@ class Follower:
         self.bridged = {index: T @ lie.se3_inverse(T_new_old) for index, T in self.bridged.items()}
         self.key = self.mapper.reference()
         self.T_cam_key, self.affine, self.age = _identity(), _no_change(), 0
-
-
-def carried_keyframe(
-    old: KeyPoints, frame: PyramidFrame, found: Track, builder: FrameBuilder, config: OdometryConfig
-) -> Keyframe:
-    """Make a frame a keyframe, with the points of an older one in which it was found.
-
-    Points that are hidden in the frame, so that their intensity differs, stay behind.
-    """
-    camera = builder.cameras[0]
-    ray, rho = old.moved(found.T_cam_key)
-    # To first order V' = V (rho' / rho)^4.
-    variance = old.points.variance * (rho / old.points.rho.clamp_min(1e-6)) ** 4
-    variance = torch.maximum(variance, config.filter.variance_floor * rho * rho)
-    uv, seen = camera.project(ray.T)
-    gained = float(found.affine[0].exp()) * old.values[0] + float(found.affine[1])
-    hidden = (frame.value(ray) - gained).abs() > config.track.cutoff
-    column = uv[:, 0].long().clamp(0, camera.width - 1)
-    row = uv[:, 1].long().clamp(0, camera.height - 1)
-    everything = CarriedPoints(row * camera.width + column, ray, InverseRange(rho, variance, old.points.score))
-    carried = everything.take(((old.points.score > 0) & seen & ~hidden).nonzero()[:, 0])
-    T_world_key = lie.se3_normalized(old.T_world_key @ lie.se3_inverse(found.T_cam_key))
-    return make_keyframe(frame, T_world_key, builder, config.map, carried)

@@ -17,7 +17,7 @@ from torchvo360.loop import (
     verify_loop,
 )
 from torchvo360.vo.frame import FrameBuilder
-from torchvo360.vo.keyframe import Keyframe
+from torchvo360.vo.keyframes.keyframe import Keyframe
 
 
 @dataclass(kw_only=True)

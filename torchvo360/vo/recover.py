@@ -12,7 +12,7 @@ from torchvo360.loop import describe_place, place_similarity
 from torchvo360.motion.rotation import align_rotation, rotation_grid, search_rotation
 from torchvo360.residuals.direct import Reference, Target
 from torchvo360.vo.frame import FrameBuilder, PyramidFrame
-from torchvo360.vo.keyframe import Keyframe, KeyPoints
+from torchvo360.vo.keyframes.keyframe import Keyframe, KeyPoints
 from torchvo360.vo.track import Track, TrackConfig, track
 
 GRID_STEP_RAD = 0.43

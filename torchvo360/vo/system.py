@@ -22,20 +22,20 @@ from torchvo360.checks import InputError, check_shape
 from torchvo360.data.frame import Frame
 from torchvo360.data.trajectory import Trajectory
 from torchvo360.vo.atlas import Atlas
-from torchvo360.vo.begin import Begun, Starter
-from torchvo360.vo.cloud import PointCloud
 from torchvo360.vo.config import OdometryConfig
-from torchvo360.vo.follow import Follower, carried_keyframe
+from torchvo360.vo.follow import Follower
 from torchvo360.vo.frame import FrameBuilder, PyramidFrame
-from torchvo360.vo.keyframe import Keyframe
-from torchvo360.vo.learned import LearnedRanges
+from torchvo360.vo.keyframes.cloud import PointCloud
+from torchvo360.vo.keyframes.keyframe import Keyframe, carried_keyframe
+from torchvo360.vo.keyframes.mapper import Mapper
 from torchvo360.vo.loops import LoopCloser, LoopEdge
-from torchvo360.vo.mapper import Mapper
 from torchvo360.vo.recover import Recovery
+from torchvo360.vo.start.begin import Begun, Starter
+from torchvo360.vo.start.learned import LearnedRanges
+from torchvo360.vo.start.stereo import StereoRanges, check_others, check_rig
 from torchvo360.vo.state import FrameEstimate, State
-from torchvo360.vo.stereo import StereoRanges, check_others, check_rig
 from torchvo360.vo.track import Track
-from torchvo360.window.calibration import intrinsics_of
+from torchvo360.window import intrinsics_of
 
 
 @dataclass(frozen=True)
@@ -303,7 +303,17 @@ class VisualOdometry:
         old, found = answer
         if self._follower is not None:
             self._retire(self._follower)
-        key = carried_keyframe(old, frame, found, self._builder, self.config)
+        config = self.config
+        key = carried_keyframe(
+            old,
+            frame,
+            found.T_cam_key,
+            found.affine,
+            self._builder,
+            config.map,
+            variance_floor=config.filter.variance_floor,
+            max_difference=config.track.cutoff,
+        )
         mapper = Mapper.begun(key, self._builder, self.config, known=True)
         self._atlas.begin(mapper, map=self._atlas.map_of(old.index), after=old.index)
         self._follow_on(mapper, key, frame)

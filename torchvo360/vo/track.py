@@ -16,7 +16,7 @@ from torchvo360.residuals.direct import Reference, look_up
 from torchvo360.residuals.weights import LossConfig
 from torchvo360.solve import LMConfig
 from torchvo360.vo.frame import PyramidFrame
-from torchvo360.vo.keyframe import Keyframe, KeyPoints
+from torchvo360.vo.keyframes.keyframe import Keyframe, KeyPoints
 
 WORST, BEST = -3.0, 2.0
 """Bounds of a tracked point's score: a frame that does not show it takes 1, one that does gives half."""

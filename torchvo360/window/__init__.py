@@ -1,5 +1,6 @@
 """Photometric bundle adjustment of a window of keyframes."""
 
+from torchvo360.window.calibration import intrinsics_of
 from torchvo360.window.config import WindowConfig
 from torchvo360.window.pattern import CENTRE, PATTERN, pattern_rays
 from torchvo360.window.points import WindowPoints, make_points
@@ -19,6 +20,7 @@ __all__ = [
     "WindowConfig",
     "WindowFrame",
     "WindowPoints",
+    "intrinsics_of",
     "make_points",
     "pattern_rays",
     "project_points",

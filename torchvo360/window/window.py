@@ -8,6 +8,7 @@ import torch
 from jaxtyping import Float64
 from torch import Tensor
 
+from torchvo360 import lie
 from torchvo360.checks import InputError
 from torchvo360.residuals.direct import Target
 from torchvo360.solve import solve_ldl
@@ -90,7 +91,7 @@ class Window:
         assert self.prior is not None
         frame = self.frames[place] = self.frames[place].linearised()
         first = self.frames[0]
-        t = (frame.T_cam_world @ torch.linalg.inv(first.T_cam_world))[:3, 3]
+        t = (frame.T_cam_world @ lie.se3_inverse(first.T_cam_world))[:3, 3]
         length2 = t.square().sum().clamp_min(1e-12)
         H = self.prior.H.clone()
         at = slice(place * PER_FRAME, place * PER_FRAME + 3)

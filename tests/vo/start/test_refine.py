@@ -14,8 +14,8 @@ from torchvo360.residuals.direct import Target
 from torchvo360.residuals.weights import LossConfig
 from torchvo360.vo import OdometryConfig
 from torchvo360.vo.frame import FrameBuilder
-from torchvo360.vo.keyframe import make_keyframe
-from torchvo360.vo.refine import JointState, _linearize, refine_jointly
+from torchvo360.vo.keyframes.keyframe import make_keyframe
+from torchvo360.vo.start.refine import JointState, _linearize, refine_jointly
 from torchvo360.window import PATTERN, pattern_rays
 
 CAMERA = Equirectangular(256, 128)

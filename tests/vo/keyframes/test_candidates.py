@@ -11,9 +11,9 @@ from torchvo360.cameras import Equirectangular
 from torchvo360.data.synthetic import SyntheticConfig, SyntheticSequence
 from torchvo360.depth import InverseRange
 from torchvo360.vo import OdometryConfig
-from torchvo360.vo.candidates import RIPE_SCORE, Candidates
 from torchvo360.vo.frame import FrameBuilder, PyramidFrame
-from torchvo360.vo.keyframe import make_keyframe
+from torchvo360.vo.keyframes.candidates import RIPE_SCORE, Candidates
+from torchvo360.vo.keyframes.keyframe import make_keyframe
 
 CAMERA = Equirectangular(256, 128)
 CONFIG = OdometryConfig(blur_px=0.5)

@@ -11,10 +11,10 @@ from torchvo360 import lie
 from torchvo360.data.synthetic import SyntheticConfig, SyntheticSequence
 from torchvo360.learn.plugin import RangeEstimate
 from torchvo360.vo import LEARNED, OdometryConfig
-from torchvo360.vo.begin import Begun, Starter
 from torchvo360.vo.frame import FrameBuilder, PyramidFrame
-from torchvo360.vo.learned import LearnedRanges
-from torchvo360.vo.pending import between
+from torchvo360.vo.start.begin import Begun, Starter
+from torchvo360.vo.start.learned import LearnedRanges
+from torchvo360.vo.start.pending import between
 
 CONFIG = OdometryConfig(blur_px=0.5)
 EYE = torch.eye(4, dtype=torch.float64)

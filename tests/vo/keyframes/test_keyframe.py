@@ -14,11 +14,9 @@ from torchvo360.data.synthetic import SyntheticConfig, SyntheticSequence
 from torchvo360.depth import InverseRange
 from torchvo360.image import equal_area_cells
 from torchvo360.vo import OdometryConfig
-from torchvo360.vo.cloud import join_clouds, to_cloud
-from torchvo360.vo.follow import carried_keyframe
 from torchvo360.vo.frame import FrameBuilder, PyramidFrame
-from torchvo360.vo.keyframe import Keyframe, KeyPoints, MapConfig, make_keyframe
-from torchvo360.vo.track import Track
+from torchvo360.vo.keyframes.cloud import join_clouds, to_cloud
+from torchvo360.vo.keyframes.keyframe import Keyframe, KeyPoints, MapConfig, carried_keyframe, make_keyframe
 
 CAMERA = Equirectangular(256, 128)
 CONFIG = OdometryConfig()
@@ -45,8 +43,16 @@ class Scene:
         return key
 
     def carry(self, key: KeyPoints, frame: PyramidFrame | None = None, T: Tensor | None = None) -> Keyframe:
-        found = Track(self.T_cam_key if T is None else T, torch.zeros(2, dtype=torch.float64), 0.0, 1.0)
-        return carried_keyframe(key, self.frames[1] if frame is None else frame, found, self.builder, CONFIG)
+        return carried_keyframe(
+            key,
+            self.frames[1] if frame is None else frame,
+            self.T_cam_key if T is None else T,
+            torch.zeros(2, dtype=torch.float64),
+            self.builder,
+            CONFIG.map,
+            variance_floor=CONFIG.filter.variance_floor,
+            max_difference=CONFIG.track.cutoff,
+        )
 
 
 @pytest.fixture(scope="module")
@@ -123,30 +129,29 @@ def test_the_mean_flow_past_a_point_is_more_than_a_right_angle(scene):
     assert key.mean_flow(T) == pytest.approx(math.pi - math.atan2(1e-2, 1.0), rel=1e-5)
 
 
-def origins(key: KeyPoints, new: Keyframe, T_cam_key: Tensor) -> tuple[Tensor, Tensor]:
-    """Return which of the new points are old ones, and which old ones: by their rays."""
+def origins(key: KeyPoints, new: Keyframe, T_cam_key: Tensor) -> Tensor:
+    """Return which of the old points the new ones are: by their rays."""
     ray, _ = key.moved(T_cam_key)
     distance, old = torch.cdist(new.ray.T.contiguous(), ray.T.contiguous()).min(1)
-    carried = (new.points.score > 0).nonzero()[:, 0]
-    assert float(distance[carried].max()) < 1e-3
-    return carried, old[carried]
+    assert float(distance.max()) < 1e-3
+    return old
 
 
 def test_carried_points_lie_at_their_exact_places_with_their_own_variance(scene):
     key = scene.key()
     new = scene.carry(key)
-    carried, old = origins(key, new, scene.T_cam_key)
-    assert len(carried) > 0.5 * len(key.pixel)
+    old = origins(key, new, scene.T_cam_key)
+    assert len(old) > 0.5 * len(key.pixel)
     assert len(old.unique()) == len(old)
     ray, rho = key.moved(scene.T_cam_key)
-    torch.testing.assert_close(new.ray[:, carried], ray[:, old], rtol=0, atol=0)
-    torch.testing.assert_close(new.points.rho[carried], rho[old], rtol=0, atol=0)
+    torch.testing.assert_close(new.ray, ray[:, old], rtol=0, atol=0)
+    torch.testing.assert_close(new.points.rho, rho[old], rtol=0, atol=0)
     expected = key.points.variance[old] * (rho[old] / key.points.rho[old]) ** 4
     expected = torch.maximum(expected, CONFIG.filter.variance_floor * rho[old] ** 2)
-    torch.testing.assert_close(new.points.variance[carried], expected, rtol=1e-5, atol=0)
+    torch.testing.assert_close(new.points.variance, expected, rtol=1e-5, atol=0)
     # the scene itself is the judge of the places: the ranges that were rendered there
-    true = 1 / scene.range_later.flatten()[new.pixel[carried]]
-    assert float(((new.points.rho[carried] - true) / true).abs().median()) < 0.01
+    true = 1 / scene.range_later.flatten()[new.pixel]
+    assert float(((new.points.rho - true) / true).abs().median()) < 0.01
     torch.testing.assert_close(new.T_world_key, lie.se3_inverse(scene.T_cam_key))
 
 
@@ -166,8 +171,7 @@ def test_no_variance_falls_below_the_floor(scene):
     key = scene.key()
     key.points = key.points._replace(variance=torch.full_like(key.points.rho, 1e-12))
     new = scene.carry(key)
-    carried, _ = origins(key, new, scene.T_cam_key)
-    relative = (new.points.variance / new.points.rho**2)[carried]
+    relative = new.points.variance / new.points.rho**2
     torch.testing.assert_close(relative, torch.full_like(relative, CONFIG.filter.variance_floor), rtol=1e-4, atol=0)
 
 
@@ -193,19 +197,8 @@ def test_of_several_points_in_a_cell_the_surest_goes_on(scene):
     backwards = EYE.clone()
     backwards[:3, 3] = torch.tensor([0.0, 0.0, 0.8])  # points far ahead crowd together
     new = scene.carry(key, frame=replace(scene.frames[1], targets=scene.frames[0].targets), T=backwards)
-    relative = (new.points.variance / new.points.rho**2)[new.points.score > 0]
+    relative = new.points.variance / new.points.rho**2
     assert float((relative < 0.02).float().mean()) > 0.5
-
-
-def test_new_points_fill_empty_cells_with_score_0_and_a_guess_from_around(scene):
-    new = scene.carry(scene.key())
-    fresh = new.points.score == 0
-    assert int(fresh.sum()) > 20
-    true = 1 / scene.range_later.flatten()[new.pixel]
-    relative = ((new.points.rho - true) / true).abs()[fresh]
-    assert float(relative.median()) < 0.3
-    assert float((new.points.variance / new.points.rho**2)[fresh].min()) >= 0.09 - 1e-5
-    assert not bool(new.trusted(0.05)[fresh].any())
 
 
 def test_points_that_are_hidden_in_the_new_frame_stay_behind(scene):
@@ -216,10 +209,9 @@ def test_points_that_are_hidden_in_the_new_frame_stay_behind(scene):
     new, free = scene.carry(key, frame=covered), scene.carry(key)
     column, column_free = new.pixel % 256, free.pixel % 256
     inside, inside_free = (column >= 60) & (column < 120), (column_free >= 60) & (column_free < 120)
-    hidden = int((new.points.score > 0)[inside].sum())
-    assert hidden < 0.5 * int((free.points.score > 0)[inside_free].sum())
-    carried, old = origins(key, new, scene.T_cam_key)
-    assert float((covered.value(new.ray[:, carried]) - key.values[0][old]).abs().max()) <= CONFIG.track.cutoff
+    assert int(inside.sum()) < 0.5 * int(inside_free.sum())
+    old = origins(key, new, scene.T_cam_key)
+    assert float((covered.value(new.ray) - key.values[0][old]).abs().max()) <= CONFIG.track.cutoff
 
 
 def test_points_with_a_low_score_are_not_carried(scene):
@@ -227,16 +219,14 @@ def test_points_with_a_low_score_are_not_carried(scene):
     score = torch.where(torch.arange(len(key.pixel)) % 3 == 0, -1.0, 1.0)
     key.points = key.points._replace(score=score)
     new = scene.carry(key)
-    _, old = origins(key, new, scene.T_cam_key)
-    assert bool((score[old] > 0).all())
+    assert len(new.pixel) > 100
+    assert bool((score[origins(key, new, scene.T_cam_key)] > 0).all())
 
 
-def test_a_keyframe_without_points_to_carry_gets_new_ones(scene):
+def test_an_old_keyframe_without_points_in_use_hands_none_over(scene):
     key = scene.key()
     key.points = key.points._replace(score=torch.full_like(key.points.score, -1.0))
-    new = scene.carry(key)
-    assert len(new.pixel) > 1000
-    assert not bool((new.points.score > 0).any())
+    assert len(scene.carry(key).pixel) == 0
 
 
 def test_a_frame_without_texture_gives_an_empty_keyframe(scene):

@@ -28,10 +28,10 @@ from torchvo360.depth import (
 from torchvo360.motion.essential import TwoView
 from torchvo360.residuals.direct import Reference, Target
 from torchvo360.residuals.weights import LossConfig
-from torchvo360.vo.corners import CornerTracks
 from torchvo360.vo.frame import FrameBuilder, PyramidFrame
-from torchvo360.vo.keyframe import Keyframe, MapConfig, make_keyframe
-from torchvo360.vo.refine import refine_jointly
+from torchvo360.vo.keyframes.keyframe import Keyframe, MapConfig, make_keyframe
+from torchvo360.vo.start.corners import CornerTracks
+from torchvo360.vo.start.refine import refine_jointly
 from torchvo360.vo.track import TrackConfig
 from torchvo360.window import pattern_rays
 

@@ -12,7 +12,7 @@ from torchvo360.data.frame import Frame
 from torchvo360.depth import InverseRange
 from torchvo360.depth.epipolar import great_circles
 from torchvo360.vo.frame import FrameBuilder, PyramidFrame
-from torchvo360.vo.keyframe import Keyframe, MapConfig, make_keyframe
+from torchvo360.vo.keyframes.keyframe import Keyframe, MapConfig, make_keyframe
 from torchvo360.window import TraceConfig, View, WindowConfig, make_points, trace
 
 MATCH_ERROR_PX = 0.3

@@ -10,10 +10,10 @@ from torch import Tensor
 from torchvo360 import lie
 from torchvo360.depth import guess_around
 from torchvo360.image import select_about
-from torchvo360.vo.candidates import Candidates
 from torchvo360.vo.config import OdometryConfig
 from torchvo360.vo.frame import FrameBuilder, PyramidFrame
-from torchvo360.vo.stereo import stereo_views
+from torchvo360.vo.keyframes.candidates import Candidates
+from torchvo360.vo.start.stereo import stereo_views
 from torchvo360.window import View, Window, WindowPoints, make_points, trace
 
 

@@ -14,10 +14,10 @@ from torchvo360.cameras import Equirectangular
 from torchvo360.data.synthetic import SyntheticConfig, SyntheticSequence
 from torchvo360.depth import InverseRange
 from torchvo360.vo import OdometryConfig
-from torchvo360.vo.cloud import PointCloud
 from torchvo360.vo.frame import FrameBuilder, PyramidFrame
-from torchvo360.vo.keyframe import Keyframe, make_keyframe
-from torchvo360.vo.mapper import Mapper
+from torchvo360.vo.keyframes.cloud import PointCloud
+from torchvo360.vo.keyframes.keyframe import Keyframe, make_keyframe
+from torchvo360.vo.keyframes.mapper import Mapper
 from torchvo360.window import WindowConfig
 
 CAMERA = Equirectangular(256, 128)

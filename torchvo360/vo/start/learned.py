@@ -9,7 +9,7 @@ from torch import Tensor, nn
 from torchvo360.depth import InverseRange
 from torchvo360.learn.plugin import checked_ranges
 from torchvo360.vo.frame import FrameBuilder, PyramidFrame
-from torchvo360.vo.keyframe import Keyframe, MapConfig, make_keyframe
+from torchvo360.vo.keyframes.keyframe import Keyframe, MapConfig, make_keyframe
 
 
 @dataclass(frozen=True)

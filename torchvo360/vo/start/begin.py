@@ -15,12 +15,12 @@ from torch import Tensor
 from torchvo360 import lie
 from torchvo360.vo.config import OdometryConfig
 from torchvo360.vo.frame import FrameBuilder, PyramidFrame
-from torchvo360.vo.initialise import Initialiser, Start
-from torchvo360.vo.keyframe import Keyframe
-from torchvo360.vo.learned import LearnedRanges
-from torchvo360.vo.mapper import Mapper
-from torchvo360.vo.pending import between, track_earlier, track_pending
-from torchvo360.vo.stereo import StereoRanges
+from torchvo360.vo.keyframes.keyframe import Keyframe
+from torchvo360.vo.keyframes.mapper import Mapper
+from torchvo360.vo.start.initialise import Initialiser, Start
+from torchvo360.vo.start.learned import LearnedRanges
+from torchvo360.vo.start.pending import between, track_earlier, track_pending
+from torchvo360.vo.start.stereo import StereoRanges
 from torchvo360.vo.track import Track, measure_keyframe
 
 LEARNED = "learned_ranges"

@@ -16,8 +16,8 @@ from torchvo360.evaluation import evaluate
 from torchvo360.motion.essential import TwoView, inverse_ranges
 from torchvo360.vo import OdometryConfig, State, VisualOdometry, initialise
 from torchvo360.vo.frame import FrameBuilder
-from torchvo360.vo.initialise import InitialiseConfig, Initialiser, Start
-from torchvo360.vo.refine import JointState
+from torchvo360.vo.start.initialise import InitialiseConfig, Initialiser, Start
+from torchvo360.vo.start.refine import JointState
 from torchvo360.window import Window
 
 

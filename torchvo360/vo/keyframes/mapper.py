@@ -8,14 +8,14 @@ from torch import Tensor
 
 from torchvo360 import lie
 from torchvo360.depth import InverseRange
-from torchvo360.image import equal_area_cells
+from torchvo360.image import equal_area_cells, one_per_cell
 from torchvo360.residuals.direct import look_up_value
-from torchvo360.vo.candidates import Candidates
-from torchvo360.vo.cloud import PointCloud, to_cloud
 from torchvo360.vo.config import OdometryConfig
 from torchvo360.vo.frame import FrameBuilder, PyramidFrame
-from torchvo360.vo.fresh import fresh_points
-from torchvo360.vo.keyframe import Keyframe
+from torchvo360.vo.keyframes.candidates import Candidates
+from torchvo360.vo.keyframes.cloud import PointCloud, to_cloud
+from torchvo360.vo.keyframes.fresh import fresh_points
+from torchvo360.vo.keyframes.keyframe import Keyframe
 from torchvo360.window import CENTRE, Window, WindowFrame, WindowPoints, make_points, project_points
 
 START_STEPS = 15
@@ -57,7 +57,7 @@ class Mapper:
         rho, variance, _ = key.points
         cell = equal_area_cells(builder.cameras[0], config.map.points, device=rho.device).flatten()
         # By the gradient, not by V: a variance that goes with a noisy rho would prefer those that came out too near.
-        index = index[_one_per_cell(cell[key.pixel[index]], -key.slope[index])]
+        index = index[one_per_cell(cell[key.pixel[index]], -key.slope[index])]
         information = config.track.noise**2 / variance[index] if known else None
         target = key.frame.targets[0]
         ray, pixel = key.ray[:, index], key.pixel[index]
@@ -246,12 +246,3 @@ class Mapper:
         self.settled, self.clouds = self.poses(), self.all_clouds()
         self.frames, self.candidates = [], None
         self.window = Window(self.window.config)
-
-
-def _one_per_cell(cell: Int64[Tensor, "N"], cost: Tensor) -> Int64[Tensor, "M"]:
-    """Return the cheapest index of each cell."""
-    by_cost = cost.argsort(stable=True)
-    order = by_cost[cell[by_cost].argsort(stable=True)]
-    first = torch.ones_like(order, dtype=torch.bool)
-    first[1:] = cell[order][1:] != cell[order][:-1]
-    return order[first]

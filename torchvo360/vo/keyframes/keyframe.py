@@ -6,11 +6,11 @@ import torch
 from jaxtyping import Bool, Float, Float64, Int64
 from torch import Tensor
 
+from torchvo360 import lie
 from torchvo360.checks import InputError, check_finite_number
 from torchvo360.depth import InverseRange
-from torchvo360.image import equal_area_cells, select_pixels
+from torchvo360.image import equal_area_cells, one_per_cell, select_pixels
 from torchvo360.residuals.direct import look_up_value
-from torchvo360.vo.carry import CarriedPoints
 from torchvo360.vo.frame import FrameBuilder, PyramidFrame
 
 
@@ -98,33 +98,64 @@ class Keyframe(KeyPoints):
 
 
 def make_keyframe(
-    frame: PyramidFrame,
-    T_world_key: Float64[Tensor, "4 4"],
-    builder: FrameBuilder,
-    config: MapConfig,
-    carried: CarriedPoints | None = None,
+    frame: PyramidFrame, T_world_key: Float64[Tensor, "4 4"], builder: FrameBuilder, config: MapConfig
 ) -> Keyframe:
-    """Choose a frame's points: those carried over from an older keyframe, and new ones in empty cells.
-
-    New points' inverse ranges are guesses, with score 0: rho 1 and variance 1 without carried points.
-    """
-    camera = builder.cameras[0]
+    """Choose a frame's points; their inverse ranges are not known yet: rho 1, variance 1 and score 0."""
     strength = builder.strength(frame)
-    usable = builder.usable(frame)
-    cell = equal_area_cells(camera, config.start_points, device=strength.device).flatten()
-    taken = torch.zeros(int(cell.max()) + 1, dtype=torch.bool, device=strength.device)
-    if carried is not None:
-        carried = carried.one_per_cell(cell[carried.pixel], usable.flatten() & (strength.flatten() > 0))
-        taken[cell[carried.pixel]] = True
-    pixel = select_pixels(
-        strength, usable & ~taken[cell].view_as(usable), camera, config.start_points, minimum=config.min_gradient
-    )
+    camera, minimum = builder.cameras[0], config.min_gradient
+    pixel = select_pixels(strength, builder.usable(frame), camera, config.start_points, minimum=minimum)
     ray = builder.rays(pixel)
     points = InverseRange(torch.ones_like(ray[0]), torch.ones_like(ray[0]), torch.zeros_like(ray[0]))
-    if carried is not None:
-        points = carried.guess(pixel, camera)
-        pixel, order = torch.cat([carried.pixel, pixel]).sort(stable=True)
-        ray = torch.cat([carried.ray, ray], 1)[:, order]
-        points = InverseRange(*(torch.cat(pair)[order] for pair in zip(carried.points, points, strict=True)))
     values = [look_up_value(target, ray) for target in frame.targets]
     return Keyframe(frame.index, T_world_key, pixel, ray, strength.flatten()[pixel], values, points, frame)
+
+
+def carried_keyframe(
+    old: KeyPoints,
+    frame: PyramidFrame,
+    T_cam_key: Float64[Tensor, "4 4"],
+    affine: Float64[Tensor, "2"],
+    builder: FrameBuilder,
+    config: MapConfig,
+    *,
+    variance_floor: float,
+    max_difference: float,
+) -> Keyframe:
+    """Make a frame a keyframe, with the points of an older one in which it was found, at their exact places.
+
+    Averages over neighbours at different ranges would be biased. Points that are hidden in the frame, so that their
+    intensity differs, stay behind; of several in a cell the surest goes on.
+
+    Args:
+        old: The older keyframe.
+        frame: The frame.
+        T_cam_key: Where it was found.
+        affine: Its brightness (a, b) against the older keyframe.
+        builder: Of the frames.
+        config: Settings.
+        variance_floor: Least relative variance V / rho^2 that a point keeps.
+        max_difference: A point whose intensity differs by more is hidden.
+    """
+    camera = builder.cameras[0]
+    ray, rho = old.moved(T_cam_key)
+    # To first order V' = V (rho' / rho)^4.
+    variance = old.points.variance * (rho / old.points.rho.clamp_min(1e-6)) ** 4
+    variance = torch.maximum(variance, variance_floor * rho * rho)
+    uv, seen = camera.project(ray.T)
+    gained = float(affine[0].exp()) * old.values[0] + float(affine[1])
+    shown = (frame.value(ray) - gained).abs() <= max_difference
+    column = uv[:, 0].long().clamp(0, camera.width - 1)
+    row = uv[:, 1].long().clamp(0, camera.height - 1)
+    pixel = row * camera.width + column
+    strength = builder.strength(frame).flatten()
+    usable = builder.usable(frame).flatten() & (strength > 0)
+    index = ((old.points.score > 0) & seen & shown & usable[pixel]).nonzero()[:, 0]
+    cell = equal_area_cells(camera, config.start_points, device=ray.device).flatten()
+    relative = variance / rho.square().clamp_min(1e-12)
+    index = index[one_per_cell(cell[pixel[index]], relative[index])]
+    index = index[pixel[index].argsort(stable=True)]
+    pixel, ray = pixel[index], ray[:, index]
+    points = InverseRange(rho[index], variance[index], old.points.score[index])
+    values = [look_up_value(target, ray) for target in frame.targets]
+    T_world_key = lie.se3_normalized(old.T_world_key @ lie.se3_inverse(T_cam_key))
+    return Keyframe(frame.index, T_world_key, pixel, ray, strength[pixel], values, points, frame)

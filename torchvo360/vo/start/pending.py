@@ -9,7 +9,7 @@ from torch import Tensor
 from torchvo360 import lie
 from torchvo360.vo.config import OdometryConfig
 from torchvo360.vo.frame import PyramidFrame
-from torchvo360.vo.keyframe import Keyframe
+from torchvo360.vo.keyframes.keyframe import Keyframe
 from torchvo360.vo.track import track
 
 

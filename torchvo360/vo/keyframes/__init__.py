@@ -1,0 +1,1 @@
+"""Keyframes, their points, and the window that adjusts them."""

@@ -11,7 +11,8 @@ from torchvo360 import lie
 from torchvo360.solve.schur import reduce
 from torchvo360.window import WindowConfig
 from torchvo360.window.energy import linearize_window
-from torchvo360.window.prior import Prior, eliminate_frame
+from torchvo360.window.prior import Prior, eliminate
+from torchvo360.window.layout import Layout
 from torchvo360.window.state import PER_FRAME
 from torchvo360.window.system import LEAST_CURVATURE
 
@@ -30,7 +31,7 @@ def test_eliminating_a_keyframe_keeps_the_others_solution(place, shared):
     H, g = spd(size, place), torch.randn(size, dtype=torch.float64, generator=torch.Generator().manual_seed(5))
     stay = torch.ones(size, dtype=torch.bool)
     stay[place * PER_FRAME : (place + 1) * PER_FRAME] = False
-    A, b = eliminate_frame(H, g, place)
+    A, b = eliminate(H, g, Layout(3, shared > 0).of(place))
     torch.testing.assert_close(torch.linalg.solve(A, b), torch.linalg.solve(H, g)[stay])
     assert torch.equal(A, A.T)
 
@@ -44,7 +45,7 @@ def test_an_unknown_of_no_curvature_takes_nothing_of_the_rest_with_it(rounding):
     without = H[others][:, others]
     H[6], H[:, 6] = 0.0, 0.0
     H[6, 6] = rounding
-    A, _ = eliminate_frame(H, g, 0)
+    A, _ = eliminate(H, g, Layout(2).of(0))
     gone = PER_FRAME - 1
     carried = without[gone:, :gone] @ torch.linalg.solve(without[:gone, :gone], without[:gone, gone:])
     torch.testing.assert_close(A, without[gone:, gone:] - carried)
@@ -54,21 +55,23 @@ def test_a_keyframe_nothing_is_known_of_carries_nothing_over():
     H, g = torch.zeros(24, 24, dtype=torch.float64), torch.zeros(24, dtype=torch.float64)
     stay = torch.cat([torch.arange(8), torch.arange(16, 24)])
     H[stay[:, None], stay], g[stay] = spd(16, 0), 1.0
-    A, b = eliminate_frame(H, g, 1)
+    A, b = eliminate(H, g, Layout(3).of(1))
     torch.testing.assert_close(A, H[stay][:, stay], rtol=1e-14, atol=0)
     torch.testing.assert_close(b, g[stay], rtol=1e-14, atol=0)
     # And one that is tied to its neighbour alone by a single measurement says nothing about the neighbour.
     row = torch.zeros(24, dtype=torch.float64)
     row[8], row[0] = 1e4, -1e4
-    A, b = eliminate_frame(H + torch.outer(row, row), g, 1)
+    A, b = eliminate(H + torch.outer(row, row), g, Layout(3).of(1))
     torch.testing.assert_close(A, H[stay][:, stay], rtol=0, atol=1e-6)
 
 
 def test_a_prior_widened_keeps_its_energy_and_knows_nothing_of_the_new_unknowns():
-    prior = Prior(spd(12, 1), torch.ones(12, dtype=torch.float64)).widened(20, shared=4)
-    d = torch.randn(20, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
-    old = torch.cat([d[:8], d[16:]])
-    torch.testing.assert_close(d @ prior.H @ d + prior.g @ d, old @ spd(12, 1) @ old + old.sum())
+    small, large = Layout(1, calibrate=True, inertial=True), Layout(3, calibrate=True, inertial=True)
+    prior = Prior(spd(24, 1), torch.ones(24, dtype=torch.float64)).widened(small, large)
+    d = torch.randn(large.size, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
+    own = [large.pose(0), slice(24, 28), large.motion(0), large.metric]
+    old = torch.cat([d[part] for part in own])
+    torch.testing.assert_close(d @ prior.H @ d + prior.g @ d, old @ spd(24, 1) @ old + old.sum())
 
 
 @pytest.mark.parametrize("place", [0, 1, 3])
@@ -115,7 +118,7 @@ def test_what_is_left_has_the_solution_of_the_whole_problem(place, calibrate):
     expected = torch.linalg.solve(H, -g)[unknown]
 
     window.drop_frame(place)
-    system = window.linearize(window.points, window.estimate(window.points), None, alone=True)
+    system = window.linearize_images(window.points, window.estimate(window.points), None)
     A, b = reduce(system.H, system.g, system.cross, system.curvature + LEAST_CURVATURE, system.slope)
     A, b = A + window.prior.H, b - window.prior.g
     step = torch.linalg.solve(A + 1e-3 * torch.eye(len(b), dtype=torch.float64), b)
@@ -177,7 +180,7 @@ def gauge_energy(first_estimates: bool) -> float:
     points = window.points
     assert points is not None
     assert window.prior is not None
-    system = window.linearize(points, window.estimate(points), None, alone=True)
+    system = window.linearize_images(points, window.estimate(points), None)
     A, _ = reduce(system.H, system.g, system.cross, system.curvature + LEAST_CURVATURE, system.slope)
     A = A + window.prior.H
     T = first if first_estimates else torch.stack([frame.T_cam_world for frame in window.frames])

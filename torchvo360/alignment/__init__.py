@@ -2,7 +2,7 @@
 
 from torchvo360.alignment.config import AlignConfig
 from torchvo360.alignment.layer import Align, align
-from torchvo360.alignment.level import match_brightness, solve_level
+from torchvo360.alignment.level import PosePrior, match_brightness, solve_level
 from torchvo360.alignment.result import AlignMaps, AlignResult, LevelHistory
 
 __all__ = [
@@ -11,6 +11,7 @@ __all__ = [
     "AlignMaps",
     "AlignResult",
     "LevelHistory",
+    "PosePrior",
     "align",
     "match_brightness",
     "solve_level",

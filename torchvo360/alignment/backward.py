@@ -10,7 +10,7 @@ from jaxtyping import Bool
 from torch import Tensor
 
 from torchvo360.alignment.config import AlignConfig
-from torchvo360.alignment.level import free_parameters, level_problem, retract
+from torchvo360.alignment.level import level_problem, retract
 from torchvo360.alignment.pyramid import Level
 from torchvo360.backends import OpenLinearization
 from torchvo360.residuals.direct import Reference, Target
@@ -57,6 +57,7 @@ def attach_steps(
     start: State,
     solution: Solution,
     config: AlignConfig,
+    free: Bool[Tensor, "8"],
     *,
     last: int | None = None,
 ) -> State:
@@ -67,13 +68,13 @@ def attach_steps(
         start: Where the steps began, with its gradients.
         solution: What came out, with its trace.
         config: Settings.
+        free: Which of (v, w, a, b) the steps moved.
         last: How many accepted steps; all of them, from `start` on, by default.
     """
     assert solution.trace is not None
     trace = solution.trace
     if last is not None:
         start, trace = last_moves(trace, last, solution.state)
-    free = free_parameters(config, start[0].device)
     problem = level_problem(level.reference, level.target, config, free)
     again = replay(problem, start, trace, masked=config.solver.fixed_steps)
     # The values stay those of the solve: summing in another order could change their last digits. What no step leads

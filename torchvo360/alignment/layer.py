@@ -125,12 +125,16 @@ def _coarse_to_fine(levels: list[Level], inputs: Inputs, config: AlignConfig, ou
     history: list[LevelHistory] = []
     unrolled = followed and config.backward == "unroll"
     for number in range(len(levels) - 1, finest, -1):
-        solution, state = _solve(levels[number], number, state, config, unrolled=unrolled, traced=traced)
+        # The first level keeps the brightness that the images as wholes show: free from the start, it takes the place
+        # of a large motion.
+        first = number == len(levels) - 1
+        moving = free_parameters(config, inputs.rho.device, motion_only=first)
+        solution, state = _solve(levels[number], number, state, config, moving, unrolled=unrolled, traced=traced)
         steps = steps + solution.steps
         if traced:
             history.append(_history(solution, state[0], inputs.batch))
     unrolled = unrolled or (followed and config.backward == "truncated")
-    solution, state = _solve(levels[finest], finest, state, config, unrolled=unrolled, traced=traced)
+    solution, state = _solve(levels[finest], finest, state, config, free, unrolled=unrolled, traced=traced)
     if traced:
         history.append(_history(solution, state[0], inputs.batch))
     status, agreed = _judged(levels[finest], solution, inputs, config)
@@ -169,7 +173,7 @@ def _coarse_to_fine(levels: list[Level], inputs: Inputs, config: AlignConfig, ou
 
 
 def _solve(
-    level: Level, number: int, state: State, config: AlignConfig, *, unrolled: bool, traced: bool
+    level: Level, number: int, state: State, config: AlignConfig, free: Tensor, *, unrolled: bool, traced: bool
 ) -> tuple[Solution, State]:
     """Return the solve of one level, and its state: with the gradients of its steps where they are unrolled."""
     T, affine = (part.detach() for part in state)
@@ -181,12 +185,13 @@ def _solve(
             affine,
             config,
             max_steps=config.most_steps(number),
+            free=free,
             traced=traced or unrolled,
         )
     if not unrolled:
         return solution, solution.state
     last = config.backward_steps if config.backward == "truncated" else None
-    return solution, attach_steps(level, state, solution, config, last=last)
+    return solution, attach_steps(level, state, solution, config, free, last=last)
 
 
 def _invertible(H: Tensor, free: Tensor) -> Tensor:

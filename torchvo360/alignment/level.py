@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from typing import NamedTuple
 
 import torch
-from jaxtyping import Bool, Float
+import torch.nn.functional as F
+from jaxtyping import Bool, Float, Float64
 from torch import Tensor
 
 from torchvo360 import lie
@@ -60,12 +62,38 @@ def is_sensible(state: tuple[Tensor, ...]) -> Bool[Tensor, "B"]:
     return (T_tgt_ref[:, :3, 3].abs() < MAX_TRANSLATION).all(-1) & (affine[:, 0].abs() < MAX_LOG_GAIN)
 
 
-def free_parameters(config: AlignConfig, device: torch.device) -> Bool[Tensor, "8"]:
+def free_parameters(config: AlignConfig, device: torch.device, *, motion_only: bool = False) -> Bool[Tensor, "8"]:
     """Return which of (v, w, a, b) are estimated."""
-    return torch.arange(8, device=device) < (8 if config.affine else 6)
+    return torch.arange(8, device=device) < (8 if config.affine and not motion_only else 6)
 
 
-def level_problem(reference: Reference, target: Target, config: AlignConfig, free: Bool[Tensor, "8"]) -> Problem:
+class PosePrior(NamedTuple):
+    """What is known of the poses besides the images: the energy d^T information d / 2 with d = Log(T T_prior^-1)."""
+
+    T_tgt_ref: Float64[Tensor, "B 4 4"]
+    information: Float64[Tensor, "B 6 6"]
+    """In the unit of the images' energy; zero for what is not known."""
+
+    def take(self, index: Tensor) -> PosePrior:
+        """Return the batch elements of an index."""
+        return PosePrior(self.T_tgt_ref[index], self.information[index])
+
+    def added(self, equations: NormalEquations, T_tgt_ref: Float64[Tensor, "B 4 4"]) -> NormalEquations:
+        """Return the normal equations with the prior's, to first order in d."""
+        d = lie.se3_log(T_tgt_ref @ lie.se3_inverse(self.T_tgt_ref))
+        pull = (self.information @ d[..., None])[..., 0]
+        H, g = F.pad(self.information, (0, 2, 0, 2)), F.pad(pull, (0, 2))
+        cost = equations.cost + 0.5 * (d * pull).sum(-1)
+        return equations._replace(H=equations.H + H, g=equations.g + g, cost=cost)
+
+
+def level_problem(
+    reference: Reference,
+    target: Target,
+    config: AlignConfig,
+    free: Bool[Tensor, "8"],
+    prior: PosePrior | None = None,
+) -> Problem:
     """Return the least-squares problem of one pyramid level."""
     B = target.padded.shape[0]
 
@@ -73,7 +101,8 @@ def level_problem(reference: Reference, target: Target, config: AlignConfig, fre
         T, affine = state
         whole = index.numel() == B
         points, images = (reference, target) if whole else (reference.take(index), target.take(index))
-        return linearize(points, images, T, affine, config.loss, noise=config.noise)
+        equations = linearize(points, images, T, affine, config.loss, noise=config.noise)
+        return equations if prior is None else (prior if whole else prior.take(index)).added(equations, T)
 
     return Problem(evaluate, retract, free, is_sensible)
 
@@ -87,6 +116,7 @@ def solve_level(
     *,
     max_steps: int,
     free: Bool[Tensor, "8"] | None = None,
+    prior: PosePrior | None = None,
     traced: bool = False,
 ) -> Solution:
     """Align at one resolution from given poses and brightness.
@@ -99,12 +129,12 @@ def solve_level(
         config: Settings; of the solver's, `max_steps` is replaced.
         max_steps: Most steps.
         free: Which of (v, w, a, b) are estimated; all, or all but (a, b), by `config.affine` when it is None.
+        prior: What is known of the poses besides.
         traced: Whether every step is noted.
     """
     B = T_tgt_ref.shape[0]
-    problem = level_problem(
-        reference, target, config, free_parameters(config, T_tgt_ref.device) if free is None else free
-    )
+    free = free_parameters(config, T_tgt_ref.device) if free is None else free
+    problem = level_problem(reference, target, config, free, prior)
     per_radian = 1 / target.camera.pixel_angle
     weight = reference.weight.double()
     mean_rho = (reference.rho.double() * weight).sum(1) / weight.sum(1).clamp_min(1e-12)

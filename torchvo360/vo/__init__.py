@@ -2,12 +2,13 @@
 
 from torchvo360.vo.config import OdometryConfig
 from torchvo360.vo.keyframes.cloud import PointCloud
-from torchvo360.vo.start.begin import LEARNED, STEREO
+from torchvo360.vo.start.begin import LEARNED, SENSOR, STEREO
 from torchvo360.vo.state import FrameEstimate, State
 from torchvo360.vo.system import OdometryResult, VisualOdometry
 
 __all__ = [
     "LEARNED",
+    "SENSOR",
     "STEREO",
     "FrameEstimate",
     "OdometryConfig",

@@ -68,6 +68,10 @@ class Atlas:
         """Return the map that a keyframe belongs to."""
         return next(session.map for session in reversed(self.sessions) if session.mapper.has(key))
 
+    def mapper_of(self, key: int) -> Mapper:
+        """Return the keyframes among which a keyframe was made."""
+        return next(session.mapper for session in reversed(self.sessions) if session.mapper.has(key))
+
     def in_world(self, T_map_cam: Float64[Tensor, "4 4"]) -> Float64[Tensor, "4 4"]:
         """Return the world pose of a camera on the present map."""
         S = self.S_world_map[self.sessions[-1].map]
@@ -106,6 +110,22 @@ class Atlas:
                 self.S_world_map[map] = moved @ self.S_world_map[map]
             self.oldest[map] = self.oldest[older]
         return True
+
+    def rescale(self, scale: float) -> None:
+        """Give the present map's unit this many metres, about its first keyframe; a map joined to another stays.
+
+        Args:
+            scale: Metres of one unit of the map, in place of what was said before.
+        """
+        map = self.sessions[-1].map
+        if self.oldest[map] != map:
+            return
+        first = next(session.mapper for session in self.sessions if session.map == map).poses()
+        centre = first[min(first)][:3, 3]
+        S = torch.eye(4, dtype=torch.float64)
+        S[:3, :3] *= scale
+        S[:3, 3] = (1 - scale) * centre
+        self.S_world_map[map] = S
 
     def keyframes(self) -> dict[int, Float64[Tensor, "4 4"]]:
         """Return S_world_key of all keyframes, by frame index."""

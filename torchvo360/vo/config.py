@@ -4,8 +4,11 @@ from dataclasses import dataclass, field
 
 from torchvo360.checks import InputError, check_finite_number
 from torchvo360.depth import EpipolarConfig, FilterConfig
+from torchvo360.motion import PoseFilterConfig
+from torchvo360.vo.inertial import InertialConfig
 from torchvo360.vo.keyframes.keyframe import MapConfig
 from torchvo360.vo.loops import LoopConfig
+from torchvo360.vo.sensor import SensorConfig
 from torchvo360.vo.start.initialise import InitialiseConfig
 from torchvo360.vo.track import TrackConfig
 from torchvo360.window import TraceConfig, WindowConfig
@@ -35,6 +38,9 @@ class OdometryConfig:
     trace: TraceConfig = field(default_factory=TraceConfig)
     window: WindowConfig = field(default_factory=WindowConfig)
     loop: LoopConfig = field(default_factory=LoopConfig)
+    sensor: SensorConfig = field(default_factory=SensorConfig)
+    motion: PoseFilterConfig = field(default_factory=PoseFilterConfig)
+    inertial: InertialConfig = field(default_factory=InertialConfig)
 
     def __post_init__(self) -> None:
         check_finite_number("blur_px", self.blur_px, above=-1e-9, at_most=5)

@@ -8,15 +8,15 @@ from jaxtyping import Float64
 from torch import Tensor
 
 from torchvo360 import lie
+from torchvo360.data.frame import Frame
 from torchvo360.vo.config import OdometryConfig
+from torchvo360.vo.foresee import MAX_PREDICTED, Expected, Foresight
 from torchvo360.vo.frame import FrameBuilder, PyramidFrame
 from torchvo360.vo.keyframes.keyframe import Keyframe, KeyPoints
 from torchvo360.vo.keyframes.mapper import Mapper
 from torchvo360.vo.recover import Recovery
 from torchvo360.vo.track import Track, judge_points, track
 
-MAX_PREDICTED = 10
-"""Frames in a row that are given the last motion; then the camera is taken to stand, or a prediction would run away."""
 DISCARDED = -1.0
 """Points of this score or less when a keyframe is made leave the map."""
 CLEARLY = 0.15
@@ -43,21 +43,21 @@ class Follower:
     config: OdometryConfig
     recovery: Recovery
     mapper: Mapper
+    foresight: Foresight
     key: Keyframe
     """What frames are tracked against: the map's points as its newest keyframe sees them."""
     T_cam_key: Float64[Tensor, "4 4"] = field(default_factory=_identity)
     affine: Float64[Tensor, "2"] = field(default_factory=_no_change)
-    motion: Float64[Tensor, "4 4"] = field(default_factory=_identity)
-    """T_cam_last from one frame to the next, by the last two that were found."""
     age: int = 0
     """Frames since the keyframe."""
     placed: PyramidFrame | None = None
     """The last frame that was found, and `T_placed_key` where: frames lost or unusable since do not count."""
     T_placed_key: Float64[Tensor, "4 4"] = field(default_factory=_identity)
-    unplaced: list[int] = field(default_factory=list)
-    """Frames since that one, by index."""
+    unplaced: dict[int, Float64[Tensor, "4 4"] | None] = field(default_factory=dict)
+    """Frames since that one, by index: T_cam_key as the IMU carried them, None without it."""
     bridged: dict[int, Float64[Tensor, "4 4"]] = field(default_factory=dict)
-    """T_cam_key of unusable frames between the last two that were found, by index: an even motion between these."""
+    """T_cam_key of unusable frames between the last two that were found, by index: an even motion between these, or the
+    IMU's with what it missed by spread over them."""
     inliers: float = 0.0
     """Of the last frame that was found."""
     elsewhere: tuple[KeyPoints, Track] | None = None
@@ -70,21 +70,37 @@ class Follower:
         """The present pose, in the map's own world and unit."""
         return lie.se3_normalized(self.key.T_world_key @ lie.se3_inverse(self.T_cam_key))
 
-    def predict(self, index: int) -> None:
-        """Move on by the last motion, for a frame that cannot be used; after a few of them, stand."""
-        self.unplaced.append(index)
-        if len(self.unplaced) <= MAX_PREDICTED:
-            self.T_cam_key = lie.se3_normalized(self.motion @ self.T_cam_key)
-        else:
+    def predict(self, frame: Frame | PyramidFrame) -> None:
+        """Move on as expected, for a frame that cannot be used; without an IMU for a few of them, then stand."""
+        expected = self._expected(frame.t_ns)
+        if not expected.carried and len(self.unplaced) < MAX_PREDICTED:
+            self.T_cam_key = lie.se3_normalized(self.foresight.motion @ self.T_cam_key)
+        elif not expected.carried:
             self.stand()
+        self._leave_unplaced(frame.index, expected)
+
+    def _leave_unplaced(self, index: int, expected: Expected) -> None:
+        """Note a frame that was not found; the IMU carries the camera on, where there is one."""
+        if expected.carried:
+            self.T_cam_key = expected.hypotheses[0]
+        self.unplaced[index] = self.T_cam_key if expected.carried else None
+
+    @property
+    def carried(self) -> bool:
+        """Whether the IMU alone has carried the camera to the last frame."""
+        return bool(self.unplaced) and next(reversed(self.unplaced.values())) is not None
+
+    def _expected(self, t_ns: int) -> Expected:
+        assert self.placed is not None
+        return self.foresight.expect(self.mapper, self.key, self.T_cam_key, self.placed, self.T_placed_key, t_ns)
 
     def stand(self) -> None:
         """Stop where the camera is, so that the error of a lost frame cannot run away."""
-        self.motion = _identity()
+        self.foresight.rest()
 
     def place(self, frame: PyramidFrame) -> None:
         """Remember where a frame was found: the present pose."""
-        self.placed, self.T_placed_key, self.unplaced = frame, self.T_cam_key, []
+        self.placed, self.T_placed_key, self.unplaced = frame, self.T_cam_key, {}
 
     def median_rho(self) -> float:
         """Return the median inverse distance of the points in use: the map's unit, as the camera sees it."""
@@ -99,27 +115,28 @@ class Follower:
         """
         self.bridged, self.left, self.elsewhere = {}, [], None
         config = self.config
-        before = self.T_cam_key
-        predicted = self.motion @ before
-        hypotheses = torch.stack([predicted, before, self.motion @ predicted])
-        limit = config.map.max_relative_variance
-        found = track(self.key, frame, hypotheses, self.affine, config.track, limit)
+        expected, limit = self._expected(frame.t_ns), config.map.max_relative_variance
+        found = None
+        for hypotheses in expected.hypotheses.split([1, len(expected.hypotheses) - 1]):
+            if found is None or found.inliers < config.weak_inliers:
+                attempt = track(self.key, frame, hypotheses, self.affine, config.track, limit, expected.prior)
+                found = max((each for each in (found, attempt) if each), key=lambda each: each.inliers, default=None)
         if found is None or found.inliers < config.weak_inliers:
             found = self.recovery.search(self.key, frame, self.placed, self.T_placed_key, self.affine, found)
-        if found is not None and self._doubtful(found):
+        corrected = None if found is None else self.foresight.corrected(expected, found)
+        if found is not None and self._doubtful(found, corrected is not None):
             # What looks alike is not always the same place: after a jump an earlier keyframe may know the frame better.
             better = max(config.weak_inliers, found.inliers + CLEARLY)
             self.elsewhere = self.recovery.relocalise(frame, better, afresh=True) if better < 1 else None
             found = None if self.elsewhere is not None else found
         if found is None or found.inliers < config.lost_inliers:
-            self.unplaced.append(frame.index)
+            self._leave_unplaced(frame.index, expected)
             return None
+        assert self.placed is not None
         since = lie.se3_log(lie.se3_normalized(found.T_cam_key @ lie.se3_inverse(self.T_placed_key)))
-        steps = len(self.unplaced) + 1
-        self.motion = lie.se3_exp(since / steps)
-        self.bridged = {
-            index: lie.se3_exp(since * ((at + 1) / steps)) @ self.T_placed_key for at, index in enumerate(self.unplaced)
-        }
+        self.bridged = self._bridged(expected, found, since)
+        dt_s = (frame.t_ns - self.placed.t_ns) / 1e9
+        self.foresight.learn(found, corrected, since, len(self.unplaced) + 1, dt_s, self.median_rho())
         self.T_cam_key, self.affine, self.inliers = found.T_cam_key, found.affine, found.inliers
         self.age += 1
         if found.inliers >= config.weak_inliers:
@@ -130,13 +147,30 @@ class Follower:
         self.place(frame)
         return found
 
-    def _doubtful(self, found: Track) -> bool:
+    def _bridged(
+        self, expected: Expected, found: Track, since: Float64[Tensor, "6"]
+    ) -> dict[int, Float64[Tensor, "4 4"]]:
+        """Return T_cam_key of the frames between the last two that were found."""
+        steps = len(self.unplaced) + 1
+        shares = {index: (at + 1) / steps for at, index in enumerate(self.unplaced)}
+        if expected.carried and all(T is not None for T in self.unplaced.values()):
+            missed = lie.se3_log(lie.se3_normalized(found.T_cam_key @ lie.se3_inverse(expected.hypotheses[0])))
+            return {
+                index: lie.se3_normalized(lie.se3_exp(missed * shares[index]) @ T)
+                for index, T in self.unplaced.items()
+                if T is not None
+            }
+        return {index: lie.se3_exp(since * share) @ self.T_placed_key for index, share in shares.items()}
+
+    def _doubtful(self, found: Track, credible: bool) -> bool:
         """Return whether a track is much worse than the last, or lies far from where the camera had been going."""
         if found.inliers < self.inliers - SUDDEN:
             return True
+        if credible:
+            return False
         T_cam_last = found.T_cam_key @ lie.se3_inverse(self.T_placed_key)
-        usual = max(MIN_JUMP_DEG, math.degrees(self.key.mean_flow(self.motion)) * JUMP * (len(self.unplaced) + 1))
-        return math.degrees(self.key.mean_flow(T_cam_last)) > usual
+        usual = math.degrees(self.key.mean_flow(self.foresight.motion)) * JUMP * (len(self.unplaced) + 1)
+        return math.degrees(self.key.mean_flow(T_cam_last)) > max(MIN_JUMP_DEG, usual)
 
     def _keyframe_due(self, found: Track) -> bool:
         settings = self.config.map
@@ -162,3 +196,4 @@ class Follower:
         self.bridged = {index: T @ lie.se3_inverse(T_new_old) for index, T in self.bridged.items()}
         self.key = self.mapper.reference()
         self.T_cam_key, self.affine, self.age = _identity(), _no_change(), 0
+        self.foresight.rekeyed(T_new_old, self.median_rho())

@@ -6,12 +6,13 @@ from dataclasses import dataclass, replace
 import cv2
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Float64, UInt8
+from jaxtyping import Bool, Float, Float32, Float64, Int64, UInt8
 from torch import Tensor
 
 from torchvo360.cameras import Camera, Rig
 from torchvo360.image import gradient_magnitude, level_camera, pad_image, resample
 from torchvo360.residuals.direct import Target, look_up_usable, make_target
+from torchvo360.vo.sensor import Sensed, SensorConfig, read_depth
 
 
 @dataclass(frozen=True)
@@ -28,6 +29,8 @@ class PyramidFrame:
     """Smoothed grey levels in [0, 1], the finest first, padded for look-up; batch 1, one channel."""
     others: tuple[Target | None, ...] = ()
     """The finest levels of a rig's further cameras; None where one gave no image."""
+    sensed: Sensed | None = None
+    """What a depth sensor knows; None without one, and where it knows nothing."""
 
     def value(self, ray: Float[Tensor, "3 *points"]) -> Float[Tensor, "*points"]:
         """Return the finest level's intensities along rays; NaN where they are unseen, masked or clipped."""
@@ -54,8 +57,9 @@ class FrameBuilder:
         saturation: float,
         device: torch.device | str = "cpu",
         rig: Rig | None = None,
+        sensor: SensorConfig | None = None,
     ) -> None:
-        self.rig = rig
+        self.rig, self._sensor = rig, SensorConfig() if sensor is None else sensor
         self.T_other_first: tuple[Float64[Tensor, "4 4"], ...] = ()
         if rig is not None:
             self.T_other_first = tuple(rig.T_other_first(other) for other in range(1, len(rig)))
@@ -92,8 +96,9 @@ class FrameBuilder:
         index: int,
         t_ns: int,
         others: Sequence[UInt8[np.ndarray, "H W 3"] | None] = (),
+        depth: Float32[np.ndarray, "H W"] | None = None,
     ) -> PyramidFrame:
-        """Return the frame of a colour image, and of those that a rig's further cameras took at the same time."""
+        """Return the frame of a colour image, and of what a rig's further cameras and a depth sensor saw with it."""
         grey = cv2.cvtColor(colour, cv2.COLOR_RGB2GRAY)
         level = torch.from_numpy(self._smoothed(grey, self.cameras[0])).to(self.device)
         targets = []
@@ -102,7 +107,8 @@ class FrameBuilder:
             padded = pad_image(level[None, None], camera, 1).contiguous()
             targets.append(Target(camera, padded, confidence, self.saturation))
         further = tuple(self._other(image, at) for at, image in enumerate(others, start=1))
-        return PyramidFrame(index, t_ns, grey, colour, targets, further)
+        sensed = read_depth(depth, self.cameras[0], self._sensor, self.device)
+        return PyramidFrame(index, t_ns, grey, colour, targets, further, sensed)
 
     def _other(self, colour: UInt8[np.ndarray, "H W 3"] | None, at: int) -> Target | None:
         if colour is None or self.rig is None:
@@ -133,3 +139,12 @@ class FrameBuilder:
         """Return unit rays of flat pixels of the finest level, so that rho is the inverse distance for every camera."""
         ray = self._rays.view(-1, 3)[pixel]
         return (ray / torch.linalg.vector_norm(ray, dim=-1, keepdim=True)).T.contiguous()
+
+    def sensed(self, frame: PyramidFrame, pixel: Int64[Tensor, "N"]) -> tuple[Float[Tensor, "N"], Float[Tensor, "N"]]:
+        """Return what a depth sensor knows at flat pixels: inverse distances and variances, infinite where nothing."""
+        if frame.sensed is None:
+            none = torch.zeros(len(pixel), device=self.device)
+            return none, torch.full_like(none, torch.inf)
+        length = torch.linalg.vector_norm(self._rays.view(-1, 3)[pixel], dim=-1)
+        rho, variance = (part.flatten()[pixel] for part in frame.sensed)
+        return rho / length, variance / length.square()

@@ -21,15 +21,20 @@ from torchvo360.cameras import Camera, Rig
 from torchvo360.checks import InputError, check_shape
 from torchvo360.data.frame import Frame
 from torchvo360.data.trajectory import Trajectory
+from torchvo360.inertial import ImuSensor
+from torchvo360.motion import PoseFilter
 from torchvo360.vo.atlas import Atlas
 from torchvo360.vo.config import OdometryConfig
 from torchvo360.vo.follow import Follower
+from torchvo360.vo.foresee import Foresight
 from torchvo360.vo.frame import FrameBuilder, PyramidFrame
+from torchvo360.vo.inertial import InertialLink
 from torchvo360.vo.keyframes.cloud import PointCloud
 from torchvo360.vo.keyframes.keyframe import Keyframe, carried_keyframe
 from torchvo360.vo.keyframes.mapper import Mapper
 from torchvo360.vo.loops import LoopCloser, LoopEdge
 from torchvo360.vo.recover import Recovery
+from torchvo360.vo.sensor import check_depth
 from torchvo360.vo.start.begin import Begun, Starter
 from torchvo360.vo.start.learned import LearnedRanges
 from torchvo360.vo.start.stereo import StereoRanges, check_others, check_rig
@@ -70,6 +75,7 @@ class VisualOdometry:
         seed: int = 0,
         device: torch.device | str = "cpu",
         rig: Rig | None = None,
+        imu: ImuSensor | None = None,
     ) -> None:
         """Prepare for frames of one camera.
 
@@ -83,6 +89,8 @@ class VisualOdometry:
             device: Where the images are kept.
             rig: The camera, first, and those fixed to it: the unit is then its metre, and every frame brings their
                 images as `others`, None for one that is missing.
+            imu: An IMU beside the camera, with its samples of the whole time: it carries the camera where images fail,
+                and once it has moved enough the unit is the metre.
 
         Raises:
             ShapeError: The mask is not of the camera's size.
@@ -99,7 +107,9 @@ class VisualOdometry:
             check_rig(rig, camera)
             if depth is not None:
                 raise InputError("rig: expected none beside a depth network: either gives the unit.")
-        self._builder = FrameBuilder(camera, levels, config.blur_px, mask, config.saturation, device, rig)
+        self._builder = FrameBuilder(
+            camera, levels, config.blur_px, mask, config.saturation, device, rig, config.sensor
+        )
         self._recovery = Recovery(self._builder, config.track, config.map.max_relative_variance)
         self._loops = LoopCloser(self._builder, config.loop)
         learned = stereo = None
@@ -107,6 +117,7 @@ class VisualOdometry:
             learned = LearnedRanges(depth, self._builder, config.map, config.track.min_points)
         if rig is not None:
             stereo = StereoRanges(self._builder, config.map, config.trace, config.window, config.track.min_points)
+        self._imu = None if imu is None else InertialLink(imu, config.inertial, config.track.noise)
         self._metric = rig is not None
         self._starter = Starter(self._builder, config, torch.Generator().manual_seed(seed), learned, stereo)
         self._atlas = Atlas()
@@ -128,7 +139,7 @@ class VisualOdometry:
         if frame.image is None or frame.problem:
             estimate = self._predict(frame)
         else:
-            ready = self._builder.build(frame.image, frame.index, frame.t_ns, frame.others)
+            ready = self._builder.build(frame.image, frame.index, frame.t_ns, frame.others, frame.depth)
             estimate = self._begin(ready) if self._follower is None else self._follow(self._follower, ready)
         estimate = replace(estimate, milliseconds=1e3 * (time.perf_counter() - began))
         self._atlas.estimates.append(estimate)
@@ -172,6 +183,7 @@ class VisualOdometry:
         if frame.image.shape != expected:
             raise InputError(f"image: expected shape {list(expected)}, got {list(frame.image.shape)}.")
         check_others(frame, self._builder)
+        check_depth(frame, camera)
 
     # Without a map
 
@@ -200,6 +212,7 @@ class VisualOdometry:
             atlas.begin(begun.mapper, map=atlas.sessions[-1].map, after=max(earlier, default=None))
         else:
             atlas.begin(begun.mapper)
+        self._metric = self._metric or begun.mapper.metric
         atlas.fill_in(begun.key, begun.T_key_cam)
         self._remembered_before, self._cameras_before = len(self._recovery), self._builder.cameras
         for key in begun.mapper.references()[:-1]:
@@ -213,9 +226,11 @@ class VisualOdometry:
     def _follow_on(
         self, mapper: Mapper, key: Keyframe, frame: PyramidFrame, motion: Float64[Tensor, "4 4"] | None = None
     ) -> None:
-        self._follower = Follower(self._builder, self.config, self._recovery, mapper, key)
+        foresight = Foresight(PoseFilter(self.config.motion), self._imu)
         if motion is not None:
-            self._follower.motion = motion
+            foresight.motion = motion
+        mapper.imu = self._imu
+        self._follower = Follower(self._builder, self.config, self._recovery, mapper, foresight, key)
         self._follower.place(frame)
         self._lost = 0
 
@@ -229,6 +244,9 @@ class VisualOdometry:
             self._atlas.anchor(index, follower.key.frame.index, lie.se3_inverse(T_cam_key))
         if (begun := self._starter.watch(frame, follower.T_map_cam)) is not None:
             return self._take_over(begun, frame)
+        if (metric := follower.mapper.window.metric) is not None:
+            self._atlas.rescale(float(metric.log_scale.exp()))
+            self._metric = True
         joined = [self._atlas.join(edge) for key in follower.left for edge in self._loops.add(key)]
         T_world_cam = self._atlas.in_world(follower.T_map_cam)
         was_lost, self._lost = self._lost > 0, 0
@@ -242,7 +260,7 @@ class VisualOdometry:
     def _predict(self, frame: Frame) -> FrameEstimate:
         reason = f"bad_frame_{frame.problem or 'unreadable'}"
         if self._follower is not None:
-            self._follower.predict(frame.index)
+            self._follower.predict(frame)
             state = State.LOST if self._lost else State.WEAK
             return _estimate(frame, self._atlas.in_world(self._follower.T_map_cam), state, reason, None)
         last = self._atlas.estimates[-1].T_world_cam if self._atlas.estimates else torch.eye(4, dtype=torch.float64)
@@ -267,9 +285,10 @@ class VisualOdometry:
         found = self._relocalised(frame)
         if found is not None:
             return found
-        follower.stand()
+        if not follower.carried:
+            follower.stand()
         T_world_cam = self._atlas.in_world(follower.T_map_cam)
-        if self._lost < self.config.restart_after:
+        if self._lost < self.config.restart_after or follower.carried:
             return _estimate(frame, T_world_cam, State.LOST, "no_agreement", None)
         unit = follower.median_rho()
         self._retire(follower)
@@ -314,7 +333,8 @@ class VisualOdometry:
             variance_floor=config.filter.variance_floor,
             max_difference=config.track.cutoff,
         )
-        mapper = Mapper.begun(key, self._builder, self.config, known=True)
+        metric = self._atlas.mapper_of(old.index).metric
+        mapper = Mapper.begun(key, self._builder, self.config, known=True, metric=metric)
         self._atlas.begin(mapper, map=self._atlas.map_of(old.index), after=old.index)
         self._follow_on(mapper, key, frame)
         self._starter.rest()

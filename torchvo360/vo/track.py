@@ -9,12 +9,13 @@ from torch import Tensor
 
 from torchvo360 import lie
 from torchvo360.agreement import share_beyond_chance
-from torchvo360.alignment import AlignConfig, solve_level
+from torchvo360.alignment import AlignConfig, PosePrior, solve_level
 from torchvo360.checks import InputError, check_finite_number
 from torchvo360.depth import InverseRange
 from torchvo360.residuals.direct import Reference, look_up
+from torchvo360.residuals.normal import NormalEquations
 from torchvo360.residuals.weights import LossConfig
-from torchvo360.solve import LMConfig
+from torchvo360.solve import LMConfig, inverse_ldl
 from torchvo360.vo.frame import PyramidFrame
 from torchvo360.vo.keyframes.keyframe import Keyframe, KeyPoints
 
@@ -62,6 +63,10 @@ class Track(NamedTuple):
     affine: Float64[Tensor, "2"]
     residual: float
     inliers: float
+    covariance: Float64[Tensor, "6 6"]
+    """Of the pose's left error (v, w), by the alignment's own residuals; infinite where it does not tell."""
+    steps: int = 0
+    """Accepted and refused steps of the solver over all levels, of the hypothesis that won."""
 
 
 def _thinned(index: Int64[Tensor, "N"], count: int) -> Int64[Tensor, "M"]:
@@ -91,6 +96,7 @@ def track(
     affine: Float64[Tensor, "2"],
     config: TrackConfig,
     max_relative_variance: float,
+    prior: PosePrior | None = None,
 ) -> Track | None:
     """Find a frame's pose against a keyframe.
 
@@ -103,6 +109,7 @@ def track(
         affine: Brightness (a, b) to start from.
         config: Settings.
         max_relative_variance: Points with V / rho^2 below this are used.
+        prior: What is known of the pose besides, a batch of one.
 
     Returns:
         The track, or None where the keyframe has too few points or no solve succeeded.
@@ -112,7 +119,8 @@ def track(
         return None
     device = key.ray.device
     T, ab = T_cam_key.to(device), affine.to(device).expand(T_cam_key.shape[0], 2)
-    levels = len(frame.targets)
+    levels, taken = len(frame.targets), 0
+    covariance = torch.full((6, 6), torch.inf, dtype=torch.float64)
     for level in range(levels - 1, -1, -1):
         count = config.points_by_level[min(level, len(config.points_by_level) - 1)]
         steps = config.steps_by_level[min(level, len(config.steps_by_level) - 1)]
@@ -121,14 +129,27 @@ def track(
         target = frame.targets[level]
         if B > 1:
             target = target.take(torch.zeros(B, dtype=torch.int64, device=T.device))
-        solution = solve_level(reference, target, T, ab, config.align_config(level == levels - 1), max_steps=steps)
+        known = None if prior is None else PosePrior(*(part.to(device).expand(B, -1, -1) for part in prior))
+        align_config = config.align_config(level == levels - 1)
+        solution = solve_level(reference, target, T, ab, align_config, max_steps=steps, prior=known)
         cost = solution.equations.cost / solution.equations.weight
         best = int(cost.nan_to_num(nan=torch.inf).argmin())
         if not bool(torch.isfinite(cost[best])):
             return None
         T, ab = solution.state[0][best : best + 1], solution.state[1][best : best + 1]
+        taken += int(solution.steps[best])
+        if level == 0:
+            covariance = _covariance(solution.equations, best)
     T_best, ab_best = lie.se3_normalized(T[0]).to(T_cam_key.device), ab[0].to(affine.device)
-    return measure(key, frame, T_best, ab_best, _thinned(usable, config.points_by_level[0]))
+    found = measure(key, frame, T_best, ab_best, _thinned(usable, config.points_by_level[0]))
+    return found._replace(covariance=covariance.to(T_cam_key.device), steps=taken)
+
+
+def _covariance(equations: NormalEquations, element: int) -> Float64[Tensor, "6 6"]:
+    """Return the pose's covariance, s^2 H^-1 with the brightness eliminated (equations.md, section 7)."""
+    inverse, ok = inverse_ldl(equations.H[element])
+    variance = equations.square[element] / (equations.weight[element] - 8).clamp_min(1)
+    return torch.where(ok, inverse[:6, :6] * variance, torch.inf)
 
 
 def measure_keyframe(key: Keyframe, config: TrackConfig, max_relative_variance: float) -> Track:
@@ -172,4 +193,4 @@ def measure(
     residual = float((samples.residual.abs() * samples.weight).sum() / weight)
     # Beyond chance: in an unrelated image of strong contrast a gain of zero explains most of the gradient.
     inliers = float(share_beyond_chance(samples, frame.targets[0].camera)[0])
-    return Track(T_cam_key, affine, residual, inliers)
+    return Track(T_cam_key, affine, residual, inliers, torch.full((6, 6), torch.inf, dtype=torch.float64))

@@ -3,11 +3,12 @@
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Float64
+from jaxtyping import Float64, Int64
 from torch import Tensor
 
 from torchvo360 import lie
-from torchvo360.window.state import PER_FRAME, POSE, Estimate, WindowFrame
+from torchvo360.window.layout import Layout
+from torchvo360.window.state import METRIC, PER_FRAME, POSE, Estimate, Metric, WindowFrame
 from torchvo360.window.system import LEAST_CURVATURE
 
 
@@ -18,25 +19,24 @@ class Prior:
     H: Float64[Tensor, "D D"]
     g: Float64[Tensor, "D"]
 
-    def widened(self, size: int, shared: int = 0) -> "Prior":
-        """Return the prior with further unknowns, of which it knows nothing, before the last `shared` ones."""
-        at = len(self.g) - shared
-        place = torch.cat([torch.arange(at), torch.arange(size - shared, size)])
-        H, g = self.H.new_zeros(size, size), self.g.new_zeros(size)
+    def widened(self, present: Layout, larger: Layout) -> "Prior":
+        """Return the prior with further unknowns, of which it knows nothing."""
+        place = present.within(larger)
+        H, g = self.H.new_zeros(larger.size, larger.size), self.g.new_zeros(larger.size)
         H[place[:, None], place], g[place] = self.H, self.g
         return Prior(H, g)
 
 
-def difference(
-    frames: list[WindowFrame], estimate: Estimate, k_first: Float64[Tensor, "4"] | None = None
-) -> Float64[Tensor, "D"]:
-    """Return how far an estimate is from the prior's point; 0 for what the prior does not hold.
+@dataclass(frozen=True)
+class First:
+    """Where the prior was linearised, of what all keyframes share; None while it says nothing of it."""
 
-    Args:
-        frames: The keyframes.
-        estimate: Where they stand.
-        k_first: Intrinsics at which the prior was linearised.
-    """
+    intrinsics: Float64[Tensor, "4"] | None = None
+    metric: Metric | None = None
+
+
+def difference(frames: list[WindowFrame], estimate: Estimate, first: First) -> Float64[Tensor, "D"]:
+    """Return how far an estimate is from the prior's point; 0 for what the prior does not hold."""
     held = [f.T_first is not None for f in frames]
     out = estimate.affine.new_zeros(len(frames), PER_FRAME)
     if any(held):
@@ -45,21 +45,25 @@ def difference(
         affine_first = torch.stack([f.affine_first for f in frames if f.affine_first is not None])
         out[at, :POSE] = lie.se3_log(estimate.T_cam_world[at] @ lie.se3_inverse(T_first))
         out[at, POSE:] = estimate.affine[at] - affine_first
-    if estimate.intrinsics is None:
-        return out.flatten()
-    k = estimate.intrinsics
-    return torch.cat([out.flatten(), torch.zeros_like(k) if k_first is None else k - k_first])
+    parts, k = [out.flatten()], estimate.intrinsics
+    if k is not None:
+        parts.append(torch.zeros_like(k) if first.intrinsics is None else k - first.intrinsics)
+    if estimate.motion is not None and estimate.metric is not None:
+        for frame, motion in zip(frames, estimate.motion, strict=True):
+            parts.append(torch.zeros_like(motion) if frame.motion_first is None else motion - frame.motion_first)
+        parts.append(out.new_zeros(METRIC) if first.metric is None else estimate.metric.since(first.metric))
+    return torch.cat(parts)
 
 
-def eliminate_frame(
-    H: Float64[Tensor, "D D"], g: Float64[Tensor, "D"], place: int
+def eliminate(
+    H: Float64[Tensor, "D D"], g: Float64[Tensor, "D"], unknowns: Int64[Tensor, "U"]
 ) -> tuple[Float64[Tensor, "E E"], Float64[Tensor, "E"]]:
-    """Marginalise one keyframe: the Schur complement of its eight unknowns, by a pseudo-inverse.
+    """Marginalise a keyframe: the Schur complement of its unknowns, by a pseudo-inverse.
 
     A combination of them that nothing is known of (a keyframe that sees no point) carries nothing over.
     """
     gone = torch.zeros(len(g), dtype=torch.bool, device=g.device)
-    gone[place * PER_FRAME : (place + 1) * PER_FRAME] = True
+    gone[unknowns] = True
     block = H[gone][:, gone]
     # Rounding leaves a curvature of nothing a little below zero: scaled up, it would drown all that is known.
     diagonal = block.diagonal()

@@ -11,15 +11,26 @@ from torch import Tensor
 from torchvo360 import lie
 from torchvo360.checks import InputError
 from torchvo360.residuals.direct import Target
+from torchvo360.residuals.inertial import Preintegrated
 from torchvo360.solve import solve_ldl
 from torchvo360.solve.schur import back_substitute, reduce
-from torchvo360.window.calibration import INTRINSICS, at_intrinsics, intrinsics_of, prior_weights, unit_rays
+from torchvo360.window.calibration import at_intrinsics, intrinsics_of, prior_weights, unit_rays
 from torchvo360.window.config import MIN_KEYFRAMES, WindowConfig
 from torchvo360.window.energy import linearize_window
+from torchvo360.window.inertial import Coupling, linearize_coupling
+from torchvo360.window.layout import Layout
 from torchvo360.window.points import WindowPoints
-from torchvo360.window.prior import Prior, difference, eliminate_frame
+from torchvo360.window.prior import First, Prior, difference, eliminate
 from torchvo360.window.settle import settle_points
-from torchvo360.window.state import PER_FRAME, POSE, Estimate, WindowFrame, estimate_of, first_poses
+from torchvo360.window.state import (
+    PER_FRAME,
+    POSE,
+    Estimate,
+    Metric,
+    WindowFrame,
+    estimate_of,
+    first_poses,
+)
 from torchvo360.window.stereo import Other, fit_brightness
 from torchvo360.window.system import LEAST_CURVATURE, WindowSystem
 
@@ -40,6 +51,18 @@ class Adjustment(NamedTuple):
     """Edges within their keyframe's threshold."""
 
 
+class Linearised(NamedTuple):
+    """The energy at an estimate, and its normal equations."""
+
+    images: WindowSystem
+    """Of the images alone: the leading unknowns, and the points."""
+    H: Float64[Tensor, "D D"]
+    """Of all else: priors and IMU."""
+    g: Float64[Tensor, "D"]
+    energy: float
+    """Of everything."""
+
+
 @dataclass
 class Window:
     """Keyframes, points and prior; with `calibrate` the intrinsics of all keyframes, too.
@@ -57,34 +80,71 @@ class Window:
     """(fx, fy, cx, cy) as they are now; None where the camera's own hold."""
     start: Float64[Tensor, "4"] | None = None
     """Where the intrinsics began: a weak prior draws them there."""
-    k_first: Float64[Tensor, "4"] | None = None
-    """Intrinsics at which the prior was linearised; None while it says nothing of them."""
+    coupling: Coupling | None = None
+    """The IMU; None without one, and before it is known how the map stands to metres and to the vertical."""
+    metric: Metric | None = None
+    """Scale and gravity, where there is an IMU."""
+    first: First = field(default_factory=First)
 
     def __post_init__(self) -> None:
         if self.config.calibrate and self.T_other_first:
             raise InputError("calibrate: expected False with a rig, whose further cameras it does not know.")
 
     @property
-    def _shared(self) -> int:
-        """Unknowns after the keyframes'."""
-        return INTRINSICS if self.config.calibrate else 0
+    def layout(self) -> Layout:
+        """Where the unknowns stand."""
+        return Layout(len(self.frames), self.config.calibrate, self.coupling is not None)
 
-    def add_frame(self, frame: WindowFrame) -> None:
+    def add_frame(self, frame: WindowFrame, segment: Preintegrated | None = None) -> None:
         """Add a keyframe as the newest. The first is held where it is, from the start.
 
         A first keyframe that is held and later marginalised as if it had been free ruins the trajectory (measured): the
         prior that holds it is marginalised with it.
+
+        Args:
+            frame: The keyframe; with its motion where there is a coupling.
+            segment: What the IMU measured since the last one, a batch of one, where there is a coupling.
         """
+        before = self.layout
         if self.config.calibrate:
             if self.intrinsics is None:
                 self.intrinsics = self.start = intrinsics_of(frame.target.camera)
             frame = _recalibrated(frame, self.intrinsics)
         self.frames.append(frame if self.frames else frame.linearised())
-        size = PER_FRAME * len(self.frames) + self._shared
         if self.prior is None:
-            held = torch.tensor([GAUGE_WEIGHT] * POSE + [GAUGE_WEIGHT, GAUGE_WEIGHT], dtype=torch.float64)
-            self.prior = Prior(torch.diag(held), torch.zeros(PER_FRAME, dtype=torch.float64)).widened(size)
-        self.prior = self.prior.widened(size, self._shared)
+            held = torch.full((PER_FRAME,), GAUGE_WEIGHT, dtype=torch.float64)
+            self.prior, before = Prior(torch.diag(held), torch.zeros_like(held)), Layout(1)
+        self.prior = self.prior.widened(before, self.layout)
+        if self.coupling is not None and segment is not None:
+            self.coupling = self.coupling.joined(segment)
+
+    def couple(
+        self,
+        coupling: Coupling,
+        metric: Metric,
+        motions: Float64[Tensor, "K 9"],
+        information: Float64[Tensor, "12"],
+    ) -> None:
+        """Begin to use an IMU.
+
+        Args:
+            coupling: With the segments between the present keyframes.
+            metric: Scale and gravity, as far as they are known.
+            motions: Velocity and biases of the keyframes.
+            information: Weights of a prior that holds the oldest keyframe's motion, then scale and gravity, to these
+                values: of standard deviations, without the coupling's weight.
+        """
+        assert self.prior is not None
+        before = self.layout
+        self.coupling, self.metric = coupling, metric
+        self.frames = [replace(frame, motion=motion) for frame, motion in zip(self.frames, motions, strict=True)]
+        # The oldest keyframe and the metric are held to where they are now; the others are not.
+        self.frames[0] = self.frames[0].linearised()
+        self.first = replace(self.first, metric=metric)
+        at = torch.arange(self.layout.size)
+        at = torch.cat([at[self.layout.motion(0)], at[self.layout.metric]])
+        self.prior = self.prior.widened(before, self.layout)
+        self.prior.H[at, at] += coupling.weight * information
 
     def hold_scale(self, place: int = 1) -> None:
         """Hold the distance of a keyframe from the first, which gives the unit where no point does."""
@@ -104,7 +164,7 @@ class Window:
 
     def estimate(self, points: WindowPoints) -> Estimate:
         """Return where the keyframes and some points stand."""
-        return estimate_of(self.frames, points.rho, self.intrinsics)
+        return estimate_of(self.frames, points.rho, self.intrinsics, self.metric)
 
     @property
     def targets(self) -> list[Target]:
@@ -127,49 +187,47 @@ class Window:
         weak, at = torch.zeros(2, len(self.frames), PER_FRAME, dtype=torch.float64)
         weak[:, POSE], weak[:, POSE + 1] = (GAIN_WEIGHT, OFFSET_WEIGHT) if self.config.affine else (GAUGE_WEIGHT,) * 2
         at[:, POSE:] = estimate.affine
-        if estimate.intrinsics is None:
-            return weak.flatten(), at.flatten()
-        assert self.start is not None
-        young = self.k_first is None and len(self.frames) < MIN_KEYFRAMES
-        weights = prior_weights(self.frames[0].target.camera, young=young)
-        return torch.cat([weak.flatten(), weights]), torch.cat([at.flatten(), estimate.intrinsics - self.start])
+        weights, off = [weak.flatten()], [at.flatten()]
+        if estimate.intrinsics is not None:
+            assert self.start is not None
+            young = self.first.intrinsics is None and len(self.frames) < MIN_KEYFRAMES
+            weights.append(prior_weights(self.frames[0].target.camera, young=young))
+            off.append(estimate.intrinsics - self.start)
+        none = torch.zeros(self.layout.size - self.layout.visual, dtype=torch.float64)
+        return torch.cat([*weights, none]), torch.cat([*off, none])
 
-    def linearize(
-        self,
-        points: WindowPoints,
-        estimate: Estimate,
-        thresholds: Tensor | None,
-        others: Sequence[Other] = (),
-        *,
-        alone: bool = False,
+    def linearize_images(
+        self, points: WindowPoints, estimate: Estimate, thresholds: Tensor | None, others: Sequence[Other] = ()
     ) -> WindowSystem:
-        """Return the normal equations of all keyframes and some points, with all priors unless they are `alone`."""
+        """Return the normal equations of all keyframes and some points, without any prior."""
         T_first = None
         if self.config.first_estimates and any(frame.T_first is not None for frame in self.frames):
             T_first = first_poses(self.frames, estimate.T_cam_world)
-        system = linearize_window(
+        return linearize_window(
             self.targets,
             points,
             estimate,
             self.config,
             T_first=T_first,
-            k_first=self.k_first if self.config.first_estimates else None,
+            k_first=self.first.intrinsics if self.config.first_estimates else None,
             thresholds=thresholds,
             others=others,
         )
-        if alone:
-            return system
-        H, g, energy = system.H.clone(), system.g.clone(), system.energy
+
+    def linearize(
+        self, points: WindowPoints, estimate: Estimate, thresholds: Tensor | None, others: Sequence[Other] = ()
+    ) -> Linearised:
+        """Return the normal equations of all unknowns: those of the images, and all else."""
+        system = self.linearize_images(points, estimate, thresholds, others)
+        assert self.prior is not None
         weak, at = self._weak_prior(estimate)
-        H.diagonal().add_(weak)
-        g += weak * at
-        energy += 0.5 * float((weak * at.square()).sum())
-        if self.prior is not None:
-            d = difference(self.frames, estimate, self.k_first)
-            H += self.prior.H
-            g += self.prior.g + self.prior.H @ d
-            energy += float(d @ self.prior.g + 0.5 * d @ self.prior.H @ d)
-        return system._replace(H=H, g=g, energy=energy)
+        d = difference(self.frames, estimate, self.first)
+        H, g = self.prior.H + torch.diag(weak), self.prior.g + self.prior.H @ d + weak * at
+        energy = 0.5 * float((weak * at.square()).sum()) + float(d @ self.prior.g + 0.5 * d @ self.prior.H @ d)
+        if self.coupling is not None:
+            inertial = linearize_coupling(self.coupling, estimate, self.layout)
+            H, g, energy = H + inertial.H, g + inertial.g, energy + inertial.energy
+        return Linearised(system, H, g, system.energy + energy)
 
     def optimise(self, steps: int | None = None) -> Adjustment:
         """Adjust all keyframes and points by Levenberg-Marquardt; a step is judged by the next linearisation."""
@@ -183,7 +241,7 @@ class Window:
             if step is None:
                 break
             proposed = estimate.moved(*step)
-            there = self.linearize(points, proposed, system.thresholds, others)
+            there = self.linearize(points, proposed, system.images.thresholds, others)
             if not there.energy < system.energy:
                 damping = max(damping * 10, 1e-3)
                 if damping > MOST_DAMPING:
@@ -194,26 +252,29 @@ class Window:
             damping = max(damping * 0.3, LEAST_DAMPING)
             if small:
                 break
+        images = system.images
         further = [
-            [t for other, t in zip(others, system.thresholds[K:], strict=True) if other.host == i] for i in range(K)
+            [t for other, t in zip(others, images.thresholds[K:], strict=True) if other.host == i] for i in range(K)
         ]
         self.frames = [
             replace(
                 frame,
                 T_cam_world=estimate.T_cam_world[i],
                 affine=estimate.affine[i],
-                thresholds=torch.stack([system.thresholds[i], *further[i]]),
+                motion=None if estimate.motion is None else estimate.motion[i],
+                thresholds=torch.stack([images.thresholds[i], *further[i]]),
             )
             for i, frame in enumerate(self.frames)
         ]
+        self.metric = estimate.metric
         if estimate.intrinsics is not None:
             self.intrinsics = estimate.intrinsics
             self.frames = [_recalibrated(frame, estimate.intrinsics) for frame in self.frames]
             points = replace(points, ray=unit_rays(self.frames[0].target.camera, points.uv))
         self.points = replace(
-            points, rho=estimate.rho, curvature=system.curvature.to(points.rho), inliers=system.inliers
+            points, rho=estimate.rho, curvature=images.curvature.to(points.rho), inliers=images.inliers
         )
-        share = float(system.inliers.sum()) / max(1, system.edges)
+        share = float(images.inliers.sum()) / max(1, images.edges)
         return Adjustment(before, system.energy, taken, share)
 
     def refine_points(self, points: WindowPoints, steps: int = 3) -> WindowPoints:
@@ -221,7 +282,7 @@ class Window:
 
         Each point accepts or refuses its own steps.
         """
-        estimate = self.estimate(points)._replace(intrinsics=None)
+        estimate = self.estimate(points)._replace(intrinsics=None, motion=None, metric=None)
         return settle_points(self.targets, points, estimate, self.config, self.others(points), steps)
 
     def keep_points(self, keep: Tensor) -> None:
@@ -243,21 +304,42 @@ class Window:
         thresholds = None
         if gone.thresholds is not None and len(known) == len(self.frames):
             thresholds = torch.cat([torch.stack([each[0] for each in known]), gone.thresholds[1:]])
-        system = self.linearize(own, estimate, thresholds, others, alone=True)
+        system = self.linearize_images(own, estimate, thresholds, others)
         used = system.inliers > 0
         diagonal = torch.where(used, system.curvature + LEAST_CURVATURE, 1.0)
         A, b = reduce(system.H, system.g, system.cross * used[:, None], diagonal, system.slope * used)
-        d = difference(self.frames, estimate, self.k_first)
-        H, g = A + self.prior.H, -b + self.prior.g + self.prior.H @ d
-        H, g = eliminate_frame(H, g, place)
+        d = difference(self.frames, estimate, self.first)
+        H, g = self.prior.H.clone(), self.prior.g + self.prior.H @ d
+        images = slice(0, self.layout.visual)
+        H[images, images] += A
+        g[images] -= b
+        H, g = self._without_segments(place, estimate, H, g)
+        H, g = eliminate(H, g, self.layout.of(place))
         # All that stay have seen the points that go: the prior holds them from now on.
         self.frames = [frame.linearised() for at, frame in enumerate(self.frames) if at != place]
         rest = points.take((~hosted).nonzero()[:, 0])
         self.points = replace(rest, host=rest.host - (rest.host > place).long())
-        self.k_first = self.intrinsics if self.k_first is None else self.k_first
-        d = difference(self.frames, self.estimate(rest), self.k_first)
+        self.first = First(
+            self.intrinsics if self.first.intrinsics is None else self.first.intrinsics,
+            self.metric if self.first.metric is None else self.first.metric,
+        )
+        d = difference(self.frames, self.estimate(rest), self.first)
         self.prior = Prior(H, g - H @ d)
         return gone, own
+
+    def _without_segments(
+        self, place: int, estimate: Estimate, H: Float64[Tensor, "D D"], g: Float64[Tensor, "D"]
+    ) -> tuple[Float64[Tensor, "D D"], Float64[Tensor, "D"]]:
+        """Add the inertial segments of a keyframe that goes to the equations, and let them go with it."""
+        if self.coupling is None:
+            return H, g
+        if place != 0:
+            raise InputError(f"place: expected 0, the oldest keyframe, with an IMU, got {place}.")
+        if len(self.frames) > 1:
+            inertial = linearize_coupling(self.coupling, estimate, self.layout, segment=0)
+            H, g = H + inertial.H, g + inertial.g
+            self.coupling = self.coupling.with_segments(self.coupling.segments.take(slice(1, None)))
+        return H, g
 
 
 def _recalibrated(frame: WindowFrame, k: Float64[Tensor, "4"]) -> WindowFrame:
@@ -265,10 +347,17 @@ def _recalibrated(frame: WindowFrame, k: Float64[Tensor, "4"]) -> WindowFrame:
     return replace(frame, target=replace(frame.target, camera=at_intrinsics(frame.target.camera, k)))
 
 
-def _step(system: WindowSystem, damping: float) -> tuple[Float64[Tensor, "D"], Float64[Tensor, "N"]] | None:
-    diagonal = system.curvature * (1 + damping) + LEAST_CURVATURE
-    A, b = reduce(system.H, system.g, system.cross, diagonal, system.slope)
+def _step(system: Linearised, damping: float) -> tuple[Float64[Tensor, "D"], Float64[Tensor, "N"]] | None:
+    images = system.images
+    diagonal = images.curvature * (1 + damping) + LEAST_CURVATURE
+    reduced, b_images = reduce(images.H, images.g, images.cross, diagonal, images.slope)
+    visual = slice(0, len(images.g))
+    A, b = system.H.clone(), -system.g
+    A[visual, visual] += reduced
+    b[visual] += b_images
+    curvature = system.H.diagonal().clone()
+    curvature[visual] += images.H.diagonal()
     # A keyframe that sees nothing has no curvature either: it must not keep the others from moving.
-    A.diagonal().add_(system.H.diagonal() * damping + LEAST_CURVATURE)
+    A.diagonal().add_(curvature * damping + LEAST_CURVATURE)
     x, ok = solve_ldl(A, b)
-    return (x, back_substitute(x, system.cross, diagonal, system.slope)) if bool(ok) else None
+    return (x, back_substitute(x[visual], images.cross, diagonal, images.slope)) if bool(ok) else None

@@ -1,4 +1,4 @@
-"""Fresh points of a keyframe: pixels chosen evenly over the sphere, and traced into what was seen before."""
+"""Fresh points of a keyframe: pixels chosen evenly over the sphere, by a depth sensor, or traced into earlier frames."""
 
 import math
 from dataclasses import replace
@@ -27,9 +27,19 @@ class Fresh(NamedTuple):
 
 
 def fresh_points(
-    window: Window, place: int, others: list[int], frame: PyramidFrame, builder: FrameBuilder, config: OdometryConfig
+    window: Window,
+    place: int,
+    others: list[int],
+    frame: PyramidFrame,
+    builder: FrameBuilder,
+    config: OdometryConfig,
+    *,
+    metric: bool = False,
 ) -> Fresh:
-    """Choose pixels of a keyframe and trace them into other keyframes, and into a rig's images of the same moment.
+    """Choose pixels of a keyframe, and find their ranges.
+
+    Where a depth sensor knows them they are taken from it, as a prior that the window weighs with the images. The
+    others are traced into other keyframes, and into a rig's images of the same moment.
 
     Args:
         window: The window.
@@ -38,12 +48,14 @@ def fresh_points(
         frame: The keyframe's frame.
         builder: Of the frames.
         config: Settings.
+        metric: Whether the window's unit is the metre, which a sensor's ranges need.
     """
     camera, strength = builder.cameras[0], builder.strength(frame)
     pixel = select_about(strength, builder.usable(frame), camera, config.map.points, minimum=config.map.min_gradient)
     start = strength.new_ones(len(pixel))
     points = make_points(frame.targets[0], pixel, builder.rays(pixel), start, config.window, place)
     points = points.take((points.weight.sum(1) > 0).nonzero()[:, 0])
+    points, measured = _split(points, frame, builder, config) if metric else (points, points.take(points.host[:0]))
     views, same_time = [view_of(window, place, other) for other in others], stereo_views(frame, builder)
     traced = trace(points, frame.targets[0], [*views, *same_time], config.trace)
     if same_time:
@@ -54,7 +66,19 @@ def fresh_points(
     known = window.refine_points(replace(points, rho=traced.rho).take(traced.found.nonzero()[:, 0]))
     known = known.take((known.inliers >= 1).nonzero()[:, 0])
     waiting = points.take(torch.isin(points.pixel, known.pixel, invert=True).nonzero()[:, 0])
+    known = known.joined(window.refine_points(measured))
     return Fresh(known, _candidates(waiting, known, strength, frame, builder))
+
+
+def _split(
+    points: WindowPoints, frame: PyramidFrame, builder: FrameBuilder, config: OdometryConfig
+) -> tuple[WindowPoints, WindowPoints]:
+    """Return the points whose ranges a sensor does not know, and those that it knows, at these ranges."""
+    rho, variance = builder.sensed(frame, points.pixel)
+    known = variance < config.map.max_relative_variance * rho.square()
+    information = config.track.noise**2 / variance
+    sensed = replace(points, rho=rho, rho_prior=rho.clone(), information=information)
+    return points.take((~known).nonzero()[:, 0]), sensed.take(known.nonzero()[:, 0])
 
 
 def _candidates(

@@ -12,12 +12,15 @@ from torchvo360.image import equal_area_cells, one_per_cell
 from torchvo360.residuals.direct import look_up_value
 from torchvo360.vo.config import OdometryConfig
 from torchvo360.vo.frame import FrameBuilder, PyramidFrame
+from torchvo360.vo.inertial import InertialLink
 from torchvo360.vo.keyframes.candidates import Candidates
 from torchvo360.vo.keyframes.cloud import PointCloud, to_cloud
 from torchvo360.vo.keyframes.fresh import fresh_points
 from torchvo360.vo.keyframes.keyframe import Keyframe
 from torchvo360.window import CENTRE, Window, WindowFrame, WindowPoints, make_points, project_points
 
+MOST_COUPLED = 40
+"""Keyframes from which scale and gravity are found, the newest."""
 START_STEPS = 15
 """Steps of the first adjustment of a start."""
 
@@ -37,11 +40,18 @@ class Mapper:
     """The points they left, in their own cameras."""
     candidates: Candidates | None = None
     """Of the newest keyframe."""
+    metric: bool = False
+    """Whether the unit is the metre, so that what a depth sensor says can be believed."""
+    imu: InertialLink | None = None
+    times_ns: dict[int, int] = field(default_factory=dict)
+    """Of all keyframes so far, by frame index."""
     _shown: Int64[Tensor, "N"] = field(default_factory=lambda: torch.zeros(0, dtype=torch.int64))
     """The points of the last `reference`, in its order."""
 
     @classmethod
-    def begun(cls, key: Keyframe, builder: FrameBuilder, config: OdometryConfig, *, known: bool) -> "Mapper":
+    def begun(
+        cls, key: Keyframe, builder: FrameBuilder, config: OdometryConfig, *, known: bool, metric: bool = False
+    ) -> "Mapper":
         """Begin with one keyframe and its points.
 
         Args:
@@ -50,8 +60,9 @@ class Mapper:
             config: Settings.
             known: Whether the ranges' variances are to be believed: they then hold the unit. Otherwise the second
                 keyframe's distance does.
+            metric: Whether the ranges are in metres.
         """
-        mapper = cls(builder, config, Window(config.window, builder.T_other_first))
+        mapper = cls(builder, config, Window(config.window, builder.T_other_first), metric=metric)
         mapper._add(key.frame, lie.se3_inverse(key.T_world_key), torch.zeros(2, dtype=torch.float64))
         index = key.trusted(config.map.max_relative_variance).nonzero()[:, 0]
         rho, variance, _ = key.points
@@ -68,8 +79,16 @@ class Mapper:
         return mapper
 
     def _add(self, frame: PyramidFrame, T_cam_world: Float64[Tensor, "4 4"], affine: Float64[Tensor, "2"]) -> None:
-        self.window.add_frame(WindowFrame(frame.index, frame.targets[0], T_cam_world, affine, frame.others))
+        segment = motion = None
+        if self.imu is not None and self.window.coupling is not None:
+            newest = self.window.frames[-1]
+            assert newest.motion is not None
+            segment = self.imu.between([self.frames[-1].t_ns, frame.t_ns], newest.motion[3:])
+            motion = self.imu.motion_after(self.window, segment)
+        placed = WindowFrame(frame.index, frame.targets[0], T_cam_world, affine, frame.others, motion=motion)
+        self.window.add_frame(placed, segment)
         self.frames.append(frame)
+        self.times_ns[frame.index] = frame.t_ns
 
     def open(self, placed: list[tuple[PyramidFrame, Float64[Tensor, "4 4"], Float64[Tensor, "2"]]]) -> None:
         """Add the further keyframes of a start; the newest one's distance from the first is the unit.
@@ -116,12 +135,21 @@ class Mapper:
         others.insert(0, others.pop(len(others) // 2))
         self._freshen(place, others)
         self._adjust()
+        if self.imu is not None and self.window.coupling is None and self._coupled(self.imu):
+            self._adjust()
         self._cull()
         left = []
         while len(self.frames) > self.config.window.keyframes:
             left.append(self.reference(0))
             self._drop(0)
         return left
+
+    def _coupled(self, imu: InertialLink) -> bool:
+        """Couple the window with the IMU, if the keyframes so far tell the scale."""
+        poses = self.poses()
+        keys = sorted(poses)[-MOST_COUPLED:]
+        T_cam_world = lie.se3_inverse(torch.stack([poses[key] for key in keys]))
+        return imu.couple(self.window, T_cam_world, [self.times_ns[key] for key in keys])
 
     def _adjust(self, steps: int | None = None) -> None:
         """Optimise the window; where that estimates the intrinsics, all that follows uses the new ones."""
@@ -148,8 +176,10 @@ class Mapper:
         self.window.keep_points(keep)
 
     def _cull(self) -> None:
-        assert self.window.points is not None
-        self.window.keep_points(self.window.points.inliers >= 1)
+        points = self.window.points
+        assert points is not None
+        # What a sensor knows stays without a second keyframe that sees it: after a quick turn it is all there is.
+        self.window.keep_points((points.inliers >= 1) | ((points.information > 0) & self.metric))
 
     def _drop(self, place: int) -> None:
         frame, points = self.window.drop_frame(place)
@@ -165,7 +195,8 @@ class Mapper:
 
     def _freshen(self, place: int, others: list[int]) -> None:
         """Give a keyframe points of its own."""
-        fresh = fresh_points(self.window, place, others, self.frames[place], self.builder, self.config)
+        frame = self.frames[place]
+        fresh = fresh_points(self.window, place, others, frame, self.builder, self.config, metric=self.metric)
         self.window.add_points(fresh.points)
         self.candidates = fresh.candidates
 

@@ -1,8 +1,8 @@
-"""How a map begins: by corners' parallax, by a rig's images of one moment, or by a depth network's ranges.
+"""How a map begins: by corners' parallax, a rig's images of one moment, a depth sensor, or a depth network's ranges.
 
-Corners need motion, and their start is checked later by their own fresh direction. A rig gives a map in metres at once.
-A depth network does too, in its metre; the corners go on beside it, and the start they make, which is more exact, takes
-its place.
+Corners need motion, and their start is checked later by their own fresh direction. A rig and a depth sensor give a map
+in metres at once. A depth network does too, in its metre; the corners go on beside it, and the start they make, which
+is more exact, takes its place.
 """
 
 from enum import Enum
@@ -20,6 +20,7 @@ from torchvo360.vo.keyframes.mapper import Mapper
 from torchvo360.vo.start.initialise import Initialiser, Start
 from torchvo360.vo.start.learned import LearnedRanges
 from torchvo360.vo.start.pending import between, track_earlier, track_pending
+from torchvo360.vo.start.sensor import SensorRanges
 from torchvo360.vo.start.stereo import StereoRanges
 from torchvo360.vo.track import Track, measure_keyframe
 
@@ -27,7 +28,8 @@ LEARNED = "learned_ranges"
 """The reason of a frame whose map is made of a depth network's ranges."""
 STEREO = "stereo_ranges"
 """The reason of a frame whose map is made of a rig's images of one moment."""
-
+SENSOR = "sensor_ranges"
+"""The reason of a frame whose map is made of a depth sensor's ranges."""
 
 MAX_EARLIER = 8
 """Frames kept of corners that ran out before there was a map."""
@@ -69,6 +71,7 @@ class Starter:
     ) -> None:
         self._builder, self._config, self._generator = builder, config, generator
         self._learned, self._stereo = learned, stereo
+        self._sensor = SensorRanges(builder, config.map, config.track.min_points)
         self.restart(torch.eye(4, dtype=torch.float64), 1.0)
 
     def restart(self, T_world_ref: Float64[Tensor, "4 4"], unit: float) -> None:
@@ -108,7 +111,9 @@ class Starter:
         """Take the next frame while there is no map; return the map that begins with it. `reason` says why not."""
         if self._stereo is not None:
             self.reason = "few_ranges"
-            return self._by_stereo(self._stereo, frame)
+            return self._by_stereo(self._stereo, frame) or self._by_sensor(frame)
+        if (begun := self._by_sensor(frame)) is not None:
+            return begun
         corners = self._corners
         pending, rotations = corners.pending, corners.rotations
         before = pending[0] if pending else None
@@ -165,7 +170,7 @@ class Starter:
         key = stereo.keyframe(frame, self._T_world_ref)
         if key is None:
             return None
-        mapper = Mapper.begun(key, self._builder, self._config, known=False)
+        mapper = Mapper.begun(key, self._builder, self._config, known=False, metric=True)
         newest, limit = mapper.reference(), self._config.map.max_relative_variance
         if int(newest.trusted(limit).sum()) < self._config.track.min_points:
             return None
@@ -173,6 +178,22 @@ class Starter:
         eye = torch.eye(4, dtype=torch.float64)
         found = measure_keyframe(newest, self._config.track, limit)
         return Begun(mapper, newest, eye, frame.index, {}, found, STEREO)
+
+    def _by_sensor(self, frame: PyramidFrame) -> Begun | None:
+        key = self._sensor.keyframe(frame, self._T_world_ref)
+        if key is None:
+            return None
+        # Frames that brought no depth have waited for this one: the few last are found by its points.
+        waiting, eye = self._corners.pending[-MAX_EARLIER:], torch.eye(4, dtype=torch.float64)
+        turns = {earlier.index: eye[:3, :3] for earlier in waiting}
+        known = {key.index: eye, **track_earlier(key, waiting, turns, self._config)}
+        T_key_cam = between(sorted(turns), known, {})
+        if waiting:
+            key.T_world_key = self.pose(waiting[0]) @ lie.se3_inverse(T_key_cam[waiting[0].index])
+        mapper = Mapper.begun(key, self._builder, self._config, known=True, metric=True)
+        self.rest()
+        found = measure_keyframe(key, self._config.track, self._config.map.max_relative_variance)
+        return Begun(mapper, key, eye, key.index, T_key_cam, found, SENSOR)
 
     def _by_network(self, frame: PyramidFrame) -> Begun | None:
         key = None if self._learned is None else self._learned.keyframe(frame, self._T_world_ref)

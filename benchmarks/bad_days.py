@@ -19,6 +19,7 @@ from torch import Tensor
 from torchvo360.cameras import Camera
 from torchvo360.data.frame import Frame
 from torchvo360.data.images import Images, judge
+from torchvo360.data.selection import Selection
 from torchvo360.data.synthetic import SyntheticConfig, SyntheticSequence
 from torchvo360.data.trajectory import Trajectory
 from torchvo360.lie import se3, so3_exp
@@ -137,7 +138,7 @@ def _read_images(images: Images, numbers: Sequence[int]) -> Iterator[Frame]:
         while end < len(numbers) and numbers[end] >= numbers[end - 1]:
             end += 1
         wanted = numbers[begin:end]
-        passing = iter(Images(images.source, images.fit, wanted[0], wanted[-1] + 1, 1))
+        passing = iter(Images(images.source, images.view, Selection(wanted[0], wanted[-1] + 1, 1)))
         at, frame = wanted[0], next(passing)
         for number in wanted:
             while at < number:

@@ -19,7 +19,7 @@ import torch
 import yaml
 
 import torchvo360
-from torchvo360 import outputs, runner
+from torchvo360 import opening, outputs, runner
 from torchvo360.cli import main
 from torchvo360.cli.command import ENVIRONMENT, conf_folder
 from torchvo360.cli.configuration import compose
@@ -50,7 +50,9 @@ def _elsewhere(tmp_path, monkeypatch):
 @pytest.fixture(scope="module")
 def pictures() -> list[np.ndarray]:
     """Frames of 128 x 64, blue first."""
-    return [np.ascontiguousarray(frame.image[..., ::-1]) for frame in SyntheticSequence(SMALL)]
+    return [
+        cv2.cvtColor(frame.image, cv2.COLOR_RGB2BGR) for frame in SyntheticSequence(SMALL) if frame.image is not None
+    ]
 
 
 @pytest.fixture
@@ -228,7 +230,7 @@ def test_a_truncated_video_is_used_as_far_as_it_goes_and_that_is_said(capsys):
 
 
 def test_wide_input_is_brought_down_unless_told_otherwise(images, monkeypatch, capsys):
-    monkeypatch.setattr(runner, "AUTO_SIZE", (64, 32))
+    monkeypatch.setattr(opening, "AUTO_WIDTH", 64)
     assert [main(["input=images", "plot=false", "out=auto"]), summary_of(Path("auto"))["width"]] == [0, 64]
     assert "frames of 128 x 64 were brought down to 64 x 32" in capsys.readouterr().out
     assert [main(["input=images", "plot=false", "out=kept", "resize=null"]), summary_of(Path("kept"))["width"]] == [
@@ -288,6 +290,50 @@ def test_a_defect_shows_itself_and_leaves_no_folder(images, monkeypatch):
     assert not Path("runs").exists()
 
 
+# Other cameras
+
+
+def test_two_panoramas_in_each_frame_give_metres_from_the_first_frame():
+    world = SyntheticSequence(SyntheticConfig(width=256, height=128, frames=10, stereo_baseline=0.2, stereo_axis="y"))
+    moments = [[image for image in (frame.image, *frame.others) if image is not None] for frame in world]
+    write_images(Path("packed"), [np.concatenate(pair)[..., ::-1] for pair in moments])
+    write_tum(Path("truth.txt"), world.truth)
+    rig = ["rig.layout=top_bottom", "rig.axis=y", "rig.baseline=0.2"]
+    assert main(["input=packed", *rig, "truth=truth.txt", "plot=false", "out=x"]) == 0
+    assert {row["reason"] for row in rows_of(Path("x"))} <= {"stereo_ranges", "ok"}
+    assert summary_of(Path("x"))["scale"] == pytest.approx(1, abs=0.02)
+
+
+def test_a_folder_of_rgbd_data_runs_without_further_settings():
+    for number in range(3):
+        Path("rgbd_dataset_freiburg3_noise/rgb").mkdir(parents=True, exist_ok=True)
+        noise = np.random.default_rng(number).integers(0, 256, (480, 640, 3), dtype=np.uint8)
+        cv2.imwrite(f"rgbd_dataset_freiburg3_noise/rgb/{number}.png", noise)
+    lines = [f"{1341846313 + number / 30:.6f} rgb/{number}.png\n" for number in range(3)]
+    Path("rgbd_dataset_freiburg3_noise/rgb.txt").write_text("".join(lines))
+    assert main(["input=rgbd_dataset_freiburg3_noise", "plot=false", "out=x"]) == 0
+    summary = summary_of(Path("x"))
+    assert (summary["width"], summary["height"], summary["frames"]) == (640, 480, 3)
+    assert rows_of(Path("x"))[0]["time"].startswith("1341846313.0")
+
+
+def test_the_odometry_is_given_the_imu(images, monkeypatch):
+    given = {}
+
+    class Odometry(VisualOdometry):
+        def __init__(self, *arguments, imu=None, **settings) -> None:
+            given["imu"] = imu
+            super().__init__(*arguments, **settings)
+
+    monkeypatch.setattr(runner, "VisualOdometry", Odometry)
+    Path("imu.csv").write_text("".join(f"{5_000_000 * k},0,0,0,0,-9.8,0\n" for k in range(60)))
+    settings = ["imu=imu.csv", "imu_sensor.T_cam_imu=[0.1,0,0,0,0,0,1]", "imu_sensor.gyro=0.002"]
+    assert main(["input=images", *settings, "plot=false", "out=x"]) == 0
+    assert (len(given["imu"].samples), given["imu"].noise.gyro) == (60, 0.002)
+    assert main(["input=images", "plot=false", "out=y"]) == 0
+    assert given["imu"] is None
+
+
 # Bad input
 
 
@@ -306,6 +352,14 @@ def prepare_bad_input(pictures) -> None:
         np.save(f"nan/{number}.npy", np.full((64, 128, 3), np.nan))
     Path("epoch.txt").write_text("".join(f"{1403636579 + k} 0 0 {k} 0 0 0 1\n" for k in range(9)))
     Path("words.txt").write_text("one two three\n")
+    lens = "cam0: {camera_model: pinhole, distortion_model: none, resolution: [752, 480], intrinsics: [%s]}"
+    Path("other_size.yaml").write_text(lens % "460, 460, 370, 240")
+    Path("no_focal_length.yaml").write_text(lens % "0, 460, 370, 240")
+    samples = ["0,0,0,9.8,0,0\n"] * 9
+    Path("epoch.csv").write_text("".join(f"{1403636579763555584 + 5000000 * k},{s}" for k, s in enumerate(samples)))
+    Path("reversed.csv").write_text("".join(f"{-5000000 * k},{s}" for k, s in enumerate(samples)))
+    Path("tum").mkdir()
+    Path("tum/rgb.txt").write_text("0.1 rgb/0.png\n")
 
 
 BAD = {
@@ -361,6 +415,32 @@ BAD = {
     "input=nan": "input: expected readable images",
     "input=synthetic every=2": "every: expected no value for a synthetic input",
     "input=synthetic synthetic.panorama=nope.jpg": "synthetic.panorama: expected the path of a readable image",
+    # cameras and rigs
+    "camera.model=pinhole": "camera.intrinsics: expected [fx, fy, cx, cy] of numbers, got None",
+    "camera.model=pinhole camera.intrinsics=[0,9,3,4]": "camera.fx: expected a focal length other than zero, got 0",
+    "camera.calibration=nope.yaml input=images": "camera.calibration: nope.yaml: expected a calibration file, got",
+    "camera.calibration=words.txt input=images": "words.txt: expected a calibration in YAML",
+    "camera.calibration=no_focal_length.yaml input=images": "no_focal_length.yaml, cam0: fx: expected a focal length",
+    "camera.calibration=other_size.yaml input=images": "expected images of 752 x 480 or in proportion",
+    "input=synthetic camera.model=equirectangular": "camera: expected no value for a synthetic input",
+    "rig.layout=top_bottom rig.T_first_second=[1,2,3]": "rig.T_first_second: expected 16 finite numbers by rows, or 7",
+    "rig.layout=top_bottom rig.baseline=1 input=images": "frames of 128 x 64: input: expected a width of twice",
+    "rig.layout=left_right rig.baseline=1 input=images": "got 64 x 64",
+    "rig.layout=left_right input=images": "rig: expected rig.baseline, rig.T_first_second or a calibration of two",
+    "rig.layout=left_right rig.T_first_second=[0,0,0,0,0,0,1] input=images camera.fit=stretch": "got 0 m apart",
+    # inertial measurements and data sets
+    "imu_sensor.T_cam_imu=[1]": "imu_sensor.T_cam_imu: expected 16 finite numbers by rows, or 7",
+    "imu=epoch.csv input=images": "imu_sensor.T_cam_imu: expected the sensor's pose, here or in camera.calibration",
+    "imu=nope.csv input=images imu_sensor.T_cam_imu=[0,0,0,0,0,0,1]": "imu: nope.csv: expected",
+    "imu=reversed.csv input=images imu_sensor.T_cam_imu=[0,0,0,0,0,0,1]": "imu: reversed.csv, line 2: expected a time",
+    "imu=epoch.csv input=images imu_sensor.T_cam_imu=[0,0,0,0,0,0,1]": "imu: expected samples at the frames' times, 0",
+    "imu=epoch.csv input=images imu_sensor.T_cam_imu=[0,0,0,0,0,0,1] imu_sensor.offset_s=1e99": "imu_sensor.offset_s: ",
+    "imu=epoch.csv input=synthetic": "imu: expected auto or null for a synthetic input",
+    "depth_scale=1000 input=images": "depth_scale: expected no value but for the folder of a data set, got 1000.0",
+    "stereo=false input=images": "stereo: expected no value but for the folder of a data set, got False",
+    "input=tum fps=10": "fps: expected no value for the data set in tum, got 10.0",
+    "input=tum rig.layout=left_right": "rig.layout: expected no value for the data set in tum, got left_right",
+    "input=tum": "camera: expected a calibration for tum",
     # masks, truths, folders
     "input=images mask=nothing.png": "mask: expected at least 1% of the image to be left",
     "input=images mask=below:90": "mask: expected at least 1% of the image to be left",

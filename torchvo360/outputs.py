@@ -131,7 +131,7 @@ def write_all(folder: Path, record: Record) -> dict[str, Any]:
         write_tum(folder / "trajectory.txt", result.trajectory)
         write_tum(folder / BEFORE_LOOPS, result.before_loops)
         _write_frames(folder / "frames.csv", result.frames)
-        write_ply(folder / "map.ply", result.points.xyz, result.points.rgb)
+        write_ply(folder / "map.ply", result.points.xyz, result.points.rgb, result.points.frame)
         if draw:
             with atomic_path(folder / "trajectory.png") as temporary:
                 states = [str(frame.state) for frame in result.frames]
@@ -179,6 +179,9 @@ def summarise(record: Record) -> dict[str, Any]:
         "fps": len(frames) / record.seconds,
         "odometry_fps": len(frames) / computing_s,
     }
+    figures["camera"] = {"model": type(record.camera).__name__.lower(), "intrinsics": list(record.camera.intrinsics)}
+    if record.result.gravity is not None:
+        figures |= {"gravity": list(record.result.gravity), "imu_offset_s": record.result.imu_offset_s}
     if record.result.intrinsics is not None:
         figures["intrinsics"] = list(record.result.intrinsics)
     if evaluation is not None:
@@ -201,6 +204,9 @@ def describe(summary: dict[str, Any], folder: Path) -> list[str]:
     ]
     if "intrinsics" in summary:
         lines.append("intrinsics fx, fy, cx, cy: " + ", ".join(f"{value:.6g}" for value in summary["intrinsics"]))
+    if "gravity" in summary:
+        axes = ", ".join(f"{value:.3f}" for value in summary["gravity"])
+        lines.append(f"gravity: {axes} m/s^2 in the world's axes; IMU times + {1e3 * summary['imu_offset_s']:.1f} ms")
     if figures := [*(name for name in ERRORS if name in summary)]:
         figures += ["coverage", "fps"]
         width = max(map(len, figures))

@@ -8,29 +8,24 @@ from collections import Counter
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
-from functools import partial
 from types import FrameType, TracebackType
 
 import cv2
 import torch
-from torch import nn
+from jaxtyping import Int64
+from torch import Tensor, nn
 from tqdm import tqdm
 
 from torchvo360.checks import InputError
-from torchvo360.data import Frame, ImageSequence, Trajectory
-from torchvo360.data.images import open_images
-from torchvo360.data.masks import parse_mask
-from torchvo360.data.synthetic import SyntheticSequence
+from torchvo360.data import Frame, Trajectory
 from torchvo360.data.tum import read_tum
 from torchvo360.evaluation import evaluate
 from torchvo360.learn.checkpoint import SHIPPED_DEPTH, load_checkpoint
 from torchvo360.learn.plugin import DepthEstimator, build
+from torchvo360.opening import Opened, open_input
 from torchvo360.outputs import Record, can_plot, describe, output_folder, write_all
-from torchvo360.settings import SHIPPED, SYNTHETIC, DepthConfig, RunConfig, embedded_clip
+from torchvo360.settings import SHIPPED, DepthConfig, RunConfig
 from torchvo360.vo import LEARNED, VisualOdometry
-
-AUTO_SIZE = (1024, 512)
-"""Width and height of wider input under `resize=auto`: more pixels cost time and gain little."""
 
 
 @dataclass(frozen=True)
@@ -90,9 +85,9 @@ def run(config: RunConfig, *, config_yaml: str = "") -> Outcome:
         raise InputError("device: expected cpu, as PyTorch finds no CUDA device here, got cuda.")
     if config.plot == "true" and not can_plot():
         raise InputError("plot: expected matplotlib, which pip install 'torchvo360[viz]' brings, or plot=false.")
-    sequence, notes = open_input(config)
+    opened = open_input(config)
+    sequence, notes = opened.sequence, opened.notes
     truth = sequence.truth if config.truth is None else _read_truth(config.truth)
-    mask = None if config.mask is None else parse_mask(config.mask, sequence.camera)
     depth = open_depth(config.depth)
     with (
         output_folder(config.out, sequence.name, overwrite=config.overwrite) as folder,
@@ -104,20 +99,21 @@ def run(config: RunConfig, *, config_yaml: str = "") -> Outcome:
         odometry = VisualOdometry(
             sequence.camera,
             config.vo,
-            mask=mask,
+            mask=opened.mask,
             depth=depth,
             seed=config.seed,
             device=config.device,
-            rig=getattr(sequence, "rig", None),
+            rig=sequence.rig,
+            imu=opened.imu,
         )
-        journey = _step_through(sequence, odometry, truth, stop, config.progress)
+        journey = _step_through(opened, odometry, truth, stop, config.progress)
         if journey.usable < 2 and stop.received:
             return Outcome([], "stopped before two frames were done: nothing is written.", 128 + stop.received)
         if journey.usable < 2:
             problems = ", ".join(f"{count} {problem}" for problem, count in journey.problems.items())
             got = f"{journey.usable} of {journey.frames}" + f" ({problems})" * bool(problems)
             raise InputError(f"input: expected at least two usable frames, got {got}.")
-        notes += getattr(sequence, "notes", [])
+        notes += sequence.notes
         if stop.received:
             of = f" of {sequence.length}" if sequence.length else ""
             notes.append(f"stopped by {stop.received.name} after {journey.frames}{of} frames; they are kept.")
@@ -162,16 +158,20 @@ class Journey:
 
 
 def _step_through(
-    sequence: ImageSequence, odometry: VisualOdometry, truth: Trajectory | None, stop: StopSignals, progress: bool
+    opened: Opened, odometry: VisualOdometry, truth: Trajectory | None, stop: StopSignals, progress: bool
 ) -> Journey:
     """Give every frame to the odometry, until they end or the user does not want any more."""
+    sequence = opened.sequence
     began = time.perf_counter()
     problems: Counter[str] = Counter()
     count = 0
     frames = iter(sequence)
     opening = list(itertools.islice(frames, 2))
     if truth is not None:
-        _check_overlap(truth, opening, sequence.length)
+        _check_overlap("truth", "poses", truth.t_ns, opening, sequence.length)
+    if opened.imu is not None:
+        t_ns = opened.imu.samples.t_ns + round(1e9 * opened.imu.offset_s)
+        _check_overlap("imu", "samples", t_ns, opening, sequence.length)
     disable = None if progress else True  # None: where standard error is no terminal
     with tqdm(total=sequence.length, desc=sequence.name, unit="frame", disable=disable, leave=False) as bar:
         for frame in itertools.chain(opening, frames):
@@ -183,39 +183,6 @@ def _step_through(
             if stop.received:
                 break
     return Journey(count, problems, time.perf_counter() - began)
-
-
-def open_input(config: RunConfig) -> tuple[ImageSequence, list[str]]:
-    """Open what `input` names, and return notes for the user on what was decided.
-
-    Raises:
-        InputError: It is missing, unreadable or not 2:1, or a setting does not go with it.
-    """
-    if config.input == SYNTHETIC:
-        usual = RunConfig()
-        for name in ("resize", "start", "stop", "every", "fps", "truth"):
-            value = getattr(config, name)
-            if value != getattr(usual, name):
-                raise InputError(f"{name}: expected no value for a synthetic input (see synthetic.*), got {value}.")
-        try:
-            return SyntheticSequence(config.synthetic), []
-        except InputError as error:
-            raise InputError(f"synthetic.{error}") from None
-    opened = partial(
-        open_images,
-        str(embedded_clip(config.input) or config.input),
-        camera_fit=config.camera.fit,
-        start=config.start,
-        stop=config.stop,
-        every=config.every,
-        fps=config.fps,
-    )
-    sequence = opened(resize=config.size)
-    if config.resize != "auto" or sequence.camera.width <= AUTO_SIZE[0]:
-        return sequence, []
-    size, auto = (" x ".join(map(str, pair)) for pair in (sequence.fit.target, AUTO_SIZE))
-    note = f"frames of {size} were brought down to {auto}; resize=WxH chooses a size, resize=null keeps theirs."
-    return opened(resize=AUTO_SIZE), [note]
 
 
 def open_depth(config: DepthConfig) -> nn.Module | None:
@@ -242,16 +209,17 @@ def _read_truth(path: str) -> Trajectory:
         raise InputError(f"truth: {error}") from None
 
 
-def _check_overlap(truth: Trajectory, opening: list[Frame], length: int | None) -> None:
-    """Refuse, before the work is done, a truth of another time: a clock's, say, for a video that starts at 0."""
+def _check_overlap(name: str, what: str, t_ns: Int64[Tensor, "N"], opening: list[Frame], length: int | None) -> None:
+    """Refuse, before the work is done, what is of another time: a clock's, say, for a video that starts at 0."""
     if len(opening) < 2:
         return
     begin_ns, period_ns = opening[0].t_ns, opening[1].t_ns - opening[0].t_ns
     end_ns = begin_ns + period_ns * (length or 0)
-    if truth.t_ns[-1] < begin_ns - period_ns or (length and truth.t_ns[0] > end_ns + period_ns):
-        first, last = (float(t_ns) / 1e9 for t_ns in truth.t_ns[[0, -1]])
+    if t_ns[-1] < begin_ns - period_ns or (length and t_ns[0] > end_ns + period_ns):
+        first, last = (float(time) / 1e9 for time in t_ns[[0, -1]])
         expected = f"{begin_ns / 1e9:g}" + (f" to {end_ns / 1e9:g} s" if length else " s and later")
-        raise InputError(f"truth: expected poses at the frames' times, {expected}, got {first:.10g} to {last:.10g} s.")
+        got = f"{first:.10g} to {last:.10g} s"
+        raise InputError(f"{name}: expected {what} at the frames' times, {expected}, got {got}.")
 
 
 @contextmanager

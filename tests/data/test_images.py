@@ -5,9 +5,11 @@ import cv2
 import numpy as np
 import pytest
 
-from torchvo360.cameras import Equirectangular
+from torchvo360.cameras import Equirectangular, Lens
 from torchvo360.checks import InputError
-from torchvo360.data.images import Images, open_images, plan_fit
+from torchvo360.data.images import Images, open_images, open_source, plan_fit
+from torchvo360.data.selection import Selection
+from torchvo360.data.undistort import undistort
 
 SHARED = Path(__file__).parents[2] / ".." / "shared"
 
@@ -326,6 +328,21 @@ def test_an_odd_width_can_be_stretched(tmp_path):
     images = open_path(write_folder(tmp_path / "room", 2, width=65, height=32), camera_fit="stretch")
     assert images.camera == Equirectangular(64, 32)
     assert [frame.image.shape for frame in images if frame.image is not None] == [(32, 64, 3)] * 2
+
+
+def test_a_lens_stands_in_for_the_panorama_and_its_bad_frames_are_told_alike(tmp_path):
+    folder = write_folder(tmp_path / "room", 5, width=64, height=48)
+    write_image(folder / "frame1.png", texture(1))
+    write_image(folder / "frame2.png", np.zeros((48, 64, 3), np.uint8))
+    view = undistort(Lens(64, 48, 60.0, 60.0, 32.0, 24.0, "radtan", (-0.1, 0.0, 0.0, 0.0)))
+    selection = Selection(stop=4)
+    source, size = open_source(str(folder), selection, None)
+    assert size == view.source_size == (64, 48)
+    images = Images(source, view, selection)
+    assert (images.camera, images.mask, images.length, images.truth) == (view.camera, view.mask, 4, None)
+    frames = list(images)
+    assert [frame.problem for frame in frames] == ["", "size", "black", ""]
+    np.testing.assert_array_equal(frames[3].image, view(texture(3, 64, 48)))
 
 
 # bad frames

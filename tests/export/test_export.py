@@ -9,7 +9,7 @@ import torch
 from torchvo360.checks import InputError, ShapeError
 from torchvo360.data.trajectory import Trajectory
 from torchvo360.data.tum import read_tum
-from torchvo360.export import write_ply, write_tum
+from torchvo360.export import read_ply, write_ply, write_tum
 from torchvo360.files import atomic_path
 from torchvo360.lie import se3_exp
 
@@ -19,13 +19,13 @@ def trajectory(t_ns: list[int]) -> Trajectory:
     return Trajectory(torch.tensor(t_ns, dtype=torch.int64), se3_exp(xi))
 
 
-def read_ply(path: Path) -> tuple[np.ndarray, np.ndarray]:
+def read_by_header(path: Path) -> tuple[np.ndarray, np.ndarray]:
     """Read by the header alone, as any other program would."""
     data = path.read_bytes()
     header, _, body = data.partition(b"end_header\n")
     lines = header.decode("ascii").splitlines()
     assert lines[:2] == ["ply", "format binary_little_endian 1.0"]
-    kinds = {"float": "<f4", "uchar": "u1"}
+    kinds = {"float": "<f4", "uchar": "u1", "int": "<i4"}
     fields = [(line.split()[2], kinds[line.split()[1]]) for line in lines if line.startswith("property")]
     count = next(int(line.split()[2]) for line in lines if line.startswith("element vertex"))
     vertices = np.frombuffer(body, np.dtype(fields))
@@ -125,10 +125,27 @@ def test_points_come_back_from_the_binary_file(tmp_path, count, dtype):
     generator = torch.Generator().manual_seed(1)
     xyz = torch.randn(count, 3, generator=generator, dtype=dtype)
     rgb = torch.randint(0, 256, (count, 3), generator=generator, dtype=torch.uint8)
-    write_ply(tmp_path / "map.ply", xyz, rgb)
-    read_xyz, read_rgb = read_ply(tmp_path / "map.ply")
+    frame = torch.arange(count, dtype=torch.int32)
+    write_ply(tmp_path / "map.ply", xyz, rgb, frame)
+    read_xyz, read_rgb = read_by_header(tmp_path / "map.ply")
     np.testing.assert_array_equal(read_xyz, xyz.float().numpy())
     np.testing.assert_array_equal(read_rgb, rgb.numpy())
+    for read, written in zip(read_ply(tmp_path / "map.ply"), (xyz.float(), rgb, frame), strict=True):
+        assert torch.equal(read, written)
+
+
+def test_points_of_a_file_that_is_missing_cut_off_or_another_are_refused(tmp_path):
+    path = tmp_path / "map.ply"
+    with pytest.raises(InputError, match="expected a point cloud, got none"):
+        read_ply(path)
+    write_ply(path, torch.zeros(5, 3), torch.zeros(5, 3, dtype=torch.uint8), torch.zeros(5).int())
+    whole = path.read_bytes()
+    path.write_bytes(whole[:-1])
+    with pytest.raises(InputError, match="the file is cut off"):
+        read_ply(path)
+    path.write_bytes(whole.replace(b"property int frame\n", b""))
+    with pytest.raises(InputError, match="as torchvo360 writes it, got another file"):
+        read_ply(path)
 
 
 @pytest.mark.parametrize(
@@ -143,5 +160,5 @@ def test_points_come_back_from_the_binary_file(tmp_path, count, dtype):
 )
 def test_bad_points_are_refused_and_nothing_is_written(tmp_path, xyz, rgb, error, message):
     with pytest.raises(error, match=f"^{message}"):
-        write_ply(tmp_path / "map.ply", xyz, rgb)
+        write_ply(tmp_path / "map.ply", xyz, rgb, torch.zeros(4).int())
     assert not list(tmp_path.iterdir())

@@ -34,11 +34,11 @@ def circle(frames: int = 60, *, tall: float = 1.0) -> Trajectory:
 def patch(centre: tuple[float, float, float], colour: str, *, size: float = 0.5, count: int = 2000) -> PointCloud:
     """Points of one colour in a cube about a place."""
     xyz = torch.tensor(centre) + size * (torch.rand(count, 3, generator=torch.Generator().manual_seed(0)) - 0.5)
-    return PointCloud(xyz, torch.tensor(list(bytes.fromhex(colour[1:])), dtype=torch.uint8).expand(count, 3))
+    return PointCloud(xyz, torch.tensor(list(bytes.fromhex(colour[1:])), dtype=torch.uint8).expand(count, 3), torch.zeros(count).int())
 
 
 def joined(*clouds: PointCloud) -> PointCloud:
-    return PointCloud(torch.cat([cloud.xyz for cloud in clouds]), torch.cat([cloud.rgb for cloud in clouds]))
+    return PointCloud(torch.cat([cloud.xyz for cloud in clouds]), torch.cat([cloud.rgb for cloud in clouds]), torch.cat([cloud.frame for cloud in clouds]))
 
 
 def read(path) -> np.ndarray:
@@ -143,7 +143,7 @@ def test_floor_and_ceiling_do_not_cover_the_walls(tmp_path, walls):
 
 
 def test_without_points_the_picture_is_that_of_the_path_alone(tmp_path):
-    none = PointCloud(torch.zeros(0, 3), torch.zeros(0, 3, dtype=torch.uint8))
+    none = PointCloud(torch.zeros(0, 3), torch.zeros(0, 3, dtype=torch.uint8), torch.zeros(0).int())
     for name, points in (("path.png", None), ("none.png", none)):
         plot_trajectory(tmp_path / name, circle(), points=points)
     assert (tmp_path / "none.png").read_bytes() == (tmp_path / "path.png").read_bytes()

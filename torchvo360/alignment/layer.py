@@ -117,7 +117,7 @@ def _coarse_to_fine(levels: list[Level], inputs: Inputs, config: AlignConfig, ou
     free = free_parameters(config, inputs.rho.device)
     brightness = inputs.T_tgt_ref.new_zeros(len(inputs.T_tgt_ref), 2)
     if config.affine:
-        brightness = match_brightness(levels[-1].reference, levels[-1].target)
+        brightness = match_brightness(levels[-1].reference, levels[-1].target, inputs.T_tgt_ref)
     state: State = (inputs.T_tgt_ref, brightness)
     followed = torch.is_grad_enabled() and has_gradient(levels[finest], state, config)
     traced = "history" in outputs

@@ -14,7 +14,7 @@ from torch import Tensor
 from torchvo360 import lie
 from torchvo360.alignment.config import AlignConfig
 from torchvo360.backends import linearize
-from torchvo360.residuals.direct import Reference, Target
+from torchvo360.residuals.direct import Reference, Target, look_up
 from torchvo360.residuals.normal import NormalEquations
 from torchvo360.solve import Problem, Solution, minimize
 
@@ -25,27 +25,36 @@ MAX_LOG_GAIN = 10.0
 """Exposures differ by less than e to this power, fourteen stops."""
 
 
-def match_brightness(reference: Reference, target: Target) -> Float[Tensor, "B 2"]:
-    """Return (a, b) that give the reference's values the target's mean and spread, over all that is usable.
+def match_brightness(
+    reference: Reference, target: Target, T_tgt_ref: Float[Tensor, "B 4 4"]
+) -> Float[Tensor, "B 2"]:
+    """Return (a, b) that give the reference's points the mean and spread of what the target shows at their places.
 
-    It needs no pose: where the same scene fills both images it is close, and exposure jumps of several stops are
-    bridged before the first step. The gain is held within a factor of five.
+    The places are those of the start. It need not be close: where the same things are in view, moments are much the
+    same, and exposure jumps of several stops are bridged before the first step. The gain is held within a factor of
+    five; where nothing is seen the brightness is taken as equal.
+
+    Args:
+        reference: Points.
+        target: Images.
+        T_tgt_ref: Starts.
     """
-    padded = target.padded[..., 1:-1, 1:-1].double()
-    ones = torch.ones_like(padded[:, :1])
-    confidence = ones if target.confidence is None else target.confidence[..., 1:-1, 1:-1].double()
-    camera = target.camera
-    area = camera.solid_angle(camera.pixel_grid(dtype=torch.float64, device=padded.device))
+    dtype = reference.value.dtype
+    samples = look_up(reference, target, T_tgt_ref.to(dtype), reference.rho.new_zeros(len(T_tgt_ref), 2))
+    weight = samples.weight.double().mean(1)
+    # A few heavy pixels say where to align, not how bright the images are.
+    weight = torch.minimum(weight, weight.mean(1, keepdim=True))
+    total = weight.sum(1).clamp_min(1e-12)
 
-    def moments(value: Tensor, weight: Tensor) -> tuple[Tensor, Tensor]:
-        total = weight.sum((1, 2)).clamp_min(1e-12)
-        mean = (value.mean(1, keepdim=True) * weight).sum((1, 2)) / total
-        variance = (((value.mean(1, keepdim=True) - mean[:, None, None]) ** 2) * weight).sum((1, 2)) / total
+    def moments(value: Tensor) -> tuple[Tensor, Tensor]:
+        each = value.double().mean(1)
+        mean = (each * weight).sum(1) / total
+        variance = ((each - mean[:, None]).square() * weight).sum(1) / total
         # The floor keeps the root's slope finite where an image has no contrast.
         return mean, (variance + 1e-16).sqrt()
 
-    mean_tgt, spread_tgt = moments(padded.flatten(2), (confidence * area).flatten(2))
-    mean_ref, spread_ref = moments(reference.value.double(), reference.weight.double()[:, None])
+    mean_tgt, spread_tgt = moments(samples.residual + samples.gained)
+    mean_ref, spread_ref = moments(samples.gained)
     a = ((spread_tgt + 1e-4) / (spread_ref + 1e-4)).log().clamp(-math.log(5), math.log(5))
     return torch.stack([a, mean_tgt - a.exp() * mean_ref], -1)
 

@@ -10,7 +10,7 @@ import hydra
 from torchvo360.cli import overrides as ours
 from torchvo360.settings import RunConfig
 
-PATHS = ("input", "truth", "out", "depth.checkpoint")
+PATHS = ("input", "truth", "out", "imu", "camera.calibration", "depth.checkpoint")
 """Keys whose value is taken as it stands: brackets, commas and equal signs are common in names of files."""
 
 

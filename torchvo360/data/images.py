@@ -1,4 +1,4 @@
-"""Equirectangular images from a video file, a folder or a glob pattern, brought to one size and judged frame by frame.
+"""Images from a video file, a folder or a glob pattern, brought to one camera and judged frame by frame.
 
 What is wrong with the whole input is refused when it is opened, in one sentence. What is wrong with a single frame is
 told by `Frame.problem`, and the sequence goes on.
@@ -13,13 +13,14 @@ from typing import Protocol
 
 import cv2
 import numpy as np
-from jaxtyping import UInt8
+from jaxtyping import Bool, UInt8
+from torch import Tensor
 
-from torchvo360.cameras import Equirectangular
+from torchvo360.cameras import Camera, Equirectangular
 from torchvo360.checks import InputError, check_choice
 from torchvo360.data.folder import IMAGE_SUFFIXES, ImageFiles, is_image_file, natural_key
-from torchvo360.data.frame import Frame
-from torchvo360.data.trajectory import Trajectory
+from torchvo360.data.frame import Frame, ImageSequence
+from torchvo360.data.selection import Selection
 from torchvo360.data.video import FALLBACK_FPS, VideoFile
 
 BLACK_MEAN, BLACK_MAX, WHITE_MEAN = 2, 16, 253
@@ -39,9 +40,30 @@ class Source(Protocol):
     def read(self, start: int, stop: int | None, every: int) -> Iterator[Frame]: ...
 
 
+class View(Protocol):
+    """How stored images become a camera's."""
+
+    @property
+    def source_size(self) -> tuple[int, int]:
+        """Width and height of the images that come in."""
+        ...
+
+    @property
+    def camera(self) -> Camera:
+        """Whose images go out."""
+        ...
+
+    @property
+    def mask(self) -> Bool[Tensor, "H W"] | None:
+        """The pixels that show something; None for all."""
+        ...
+
+    def __call__(self, image: UInt8[np.ndarray, "h w 3"]) -> UInt8[np.ndarray, "H W 3"]: ...
+
+
 @dataclass(frozen=True)
 class Fit:
-    """How an image of one size becomes 2:1: rows cut away above and below, then resampling."""
+    """How an image of one size becomes a 2:1 panorama: rows cut away above and below, then resampling."""
 
     width: int
     height: int
@@ -50,6 +72,17 @@ class Fit:
     rows: int
     target: tuple[int, int]
     """Width and height of the images that go out."""
+    mask = None
+
+    @property
+    def source_size(self) -> tuple[int, int]:
+        """Width and height of the images that come in."""
+        return self.width, self.height
+
+    @property
+    def camera(self) -> Equirectangular:
+        """The panorama."""
+        return Equirectangular(*self.target)
 
     def __call__(self, image: UInt8[np.ndarray, "h w 3"]) -> UInt8[np.ndarray, "H W 3"]:
         """Return the image at the target size."""
@@ -83,34 +116,38 @@ def plan_fit(width: int, height: int, camera_fit: str, resize: tuple[int, int] |
                     "camera.fit=stretch accepts it."
                 )
             first_row = (height - rows) // 2
+    if resize is not None and (len(resize) != 2 or min(resize) < 1 or resize[0] != 2 * resize[1]):
+        raise InputError(f"resize: expected a width of twice the height, got {' x '.join(map(str, resize))}.")
     target = resize or (2 * rows, rows)
     return Fit(width, height, first_row, height if camera_fit == "stretch" else rows, target)
 
 
-class Images:
-    """An image sequence from a source, every good frame 2:1 and of one size; it can be iterated again."""
+class Images(ImageSequence):
+    """An image sequence from a source, every good frame one camera's; it can be iterated again."""
 
-    def __init__(self, source: Source, fit: Fit, start: int, stop: int | None, every: int) -> None:
+    def __init__(self, source: Source, fit: View, selection: Selection) -> None:
         self.source = source
         self.fit = fit
-        self.selection = start, stop, every
+        self.selection = selection
 
     @property
     def name(self) -> str:
         return self.source.name
 
     @property
-    def camera(self) -> Equirectangular:
-        return Equirectangular(*self.fit.target)
+    def camera(self) -> Camera:
+        return self.fit.camera
+
+    @property
+    def mask(self) -> Bool[Tensor, "H W"] | None:
+        return self.fit.mask
 
     @property
     def length(self) -> int | None:
-        start, stop, every = self.selection
-        return None if self.source.length is None else len(range(self.source.length)[start:stop:every])
-
-    @property
-    def truth(self) -> Trajectory | None:
-        return None
+        if self.source.length is None:
+            return None
+        chosen = self.selection
+        return len(range(self.source.length)[chosen.start : chosen.stop : chosen.every])
 
     @property
     def notes(self) -> list[str]:
@@ -118,13 +155,13 @@ class Images:
         return self.source.notes
 
     def __iter__(self) -> Iterator[Frame]:
-        return map(self._prepare, self.source.read(*self.selection))
+        return map(self._prepare, self.source.read(self.selection.start, self.selection.stop, self.selection.every))
 
     def _prepare(self, frame: Frame) -> Frame:
         if frame.image is None:
             return frame
         height, width = frame.image.shape[:2]
-        if (width, height) != (self.fit.width, self.fit.height):
+        if (width, height) != self.fit.source_size:
             return Frame(frame.index, frame.t_ns, None, "size")
         image = self.fit(frame.image)
         return Frame(frame.index, frame.t_ns, image, judge(image))
@@ -173,49 +210,48 @@ def open_images(
         InputError: The input is missing, unreadable, not 2:1 or shorter than two frames, or an argument is not valid.
     """
     check_choice("camera.fit", camera_fit, ("none", "stretch", "crop"))
-    _check_selection(start, stop, every)
+    selection = Selection(start, stop, every)
+    source, size = open_source(path, selection, fps)
+    return Images(source, plan_fit(*size, camera_fit, resize), selection)
+
+
+def open_source(path: str, selection: Selection, fps: float | None) -> tuple[Source, tuple[int, int]]:
+    """Open a video file, a folder of images or a glob pattern, and return it with the size of its first frames.
+
+    Args:
+        path: As of `open_images`.
+        selection: The frames that will be read.
+        fps: Frame rate, as of `open_images`.
+
+    Raises:
+        InputError: The input is missing, unreadable or shorter than two frames, or the frame rate is none.
+    """
     if fps is not None and not (math.isfinite(fps) and fps > 0):
         raise InputError(f"fps: expected a frame rate above 0, got {fps}.")
     if fps is not None and not MIN_FPS <= fps <= MAX_FPS:
         raise InputError(f"fps: expected a frame rate from {MIN_FPS:g} to {MAX_FPS:g}, got {fps}.")
-    if resize is not None and (len(resize) != 2 or min(resize) < 1 or resize[0] != 2 * resize[1]):
-        raise InputError(f"resize: expected a width of twice the height, got {' x '.join(map(str, resize))}.")
-    source = _open_source(path, fps)
-    selected = _select(source, start, stop, every)
-    size = source.size(selected)
+    source = _find_source(path, fps)
+    size = source.size(_select(source, selection))
     if size is None:
         raise InputError(f"input: expected readable images, got none among the first of {path}.")
-    return Images(source, plan_fit(*size, camera_fit, resize), start, stop, every)
+    return source, size
 
 
-def _check_selection(start: int, stop: int | None, every: int) -> None:
-    if start < 0:
-        raise InputError(f"start: expected at least 0, got {start}.")
-    if stop is not None and stop <= start:
-        raise InputError(f"stop: expected more than start ({start}), got {stop}.")
-    if every < 1:
-        raise InputError(f"every: expected at least 1, got {every}.")
-
-
-def _select(source: Source, start: int, stop: int | None, every: int) -> range:
+def _select(source: Source, chosen: Selection) -> range:
     """Return the selected indices, as far as they are known.
 
     Raises:
         InputError: Fewer than two are left.
     """
-    if source.length is None:
-        known = range(start, start + 2 * every if stop is None else stop, every)
-    elif start >= source.length > 1:
-        raise InputError(f"start: expected less than the {source.length} frames of the input, got {start}.")
-    else:
-        known = range(source.length)[start:stop:every]
+    if source.length is not None:
+        return chosen.of(source.length)
+    known = range(chosen.start, chosen.start + 2 * chosen.every if chosen.stop is None else chosen.stop, chosen.every)
     if len(known) < 2:
-        chosen = "" if (start, stop, every) == (0, None, 1) else " after start, stop and every"
-        raise InputError(f"input: expected at least two frames{chosen}, got {len(known)}.")
+        raise InputError(f"input: expected at least two frames after start, stop and every, got {len(known)}.")
     return known
 
 
-def _open_source(path: str, fps: float | None) -> Source:
+def _find_source(path: str, fps: float | None) -> Source:
     location = Path(path).expanduser()
     if not path:
         raise InputError("input: expected a video, a folder of images or a glob pattern, got an empty name.")

@@ -19,7 +19,7 @@ def pad_image(image: Float[Tensor, "*batch H W"], camera: Camera, margin: int) -
         InputError: The margin is larger than the image, or a panorama's width is odd: no opposite column.
     """
     check_image_size("image", image, camera)
-    if margin > min(camera.height, camera.width):
+    if camera.wraps and margin > min(camera.height, camera.width):
         raise InputError(f"margin: expected at most the image's size, got {margin}.")
     if not camera.wraps:
         rows = torch.arange(-margin, camera.height + margin, device=image.device).clamp(0, camera.height - 1)

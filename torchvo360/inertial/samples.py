@@ -7,7 +7,11 @@ import torch
 from jaxtyping import Float64, Int64
 from torch import Tensor
 
-from torchvo360.checks import InputError, check_finite_number, check_pose, check_shape
+from torchvo360.checks import InputError, check_pose, check_shape
+from torchvo360.residuals.inertial import ImuNoise
+
+GRAVITY = 9.81
+"""Length of gravity, m/s^2; it differs by 0.3 % between the equator and the poles."""
 
 
 def _identity() -> Float64[Tensor, "4 4"]:
@@ -16,7 +20,7 @@ def _identity() -> Float64[Tensor, "4 4"]:
 
 @dataclass(frozen=True, eq=False)
 class ImuSamples:
-    """Samples of one IMU in its own axes; sample m holds from its time until the next one's.
+    """Samples of one IMU in its own axes, each of its instant; between them they are taken as linear in time.
 
     `accel` is the specific force: at rest it points up and has the length of gravity.
     """
@@ -54,24 +58,6 @@ class ImuSamples:
     def period_ns(self) -> int:
         """The median time between samples."""
         return int(self.t_ns.diff().median())
-
-
-@dataclass(kw_only=True)
-class ImuNoise:
-    """Densities of an IMU's white noise and of its biases' random walk; the defaults are EuRoC's ADIS16448."""
-
-    gyro: float = 1.6968e-4
-    """rad / s / sqrt(Hz)."""
-    accel: float = 2.0e-3
-    """m / s^2 / sqrt(Hz)."""
-    gyro_walk: float = 1.9393e-5
-    """rad / s^2 / sqrt(Hz)."""
-    accel_walk: float = 3.0e-3
-    """m / s^3 / sqrt(Hz)."""
-
-    def __post_init__(self) -> None:
-        for name in ("gyro", "accel", "gyro_walk", "accel_walk"):
-            check_finite_number(name, getattr(self, name), above=0)
 
 
 @dataclass(frozen=True, eq=False)

@@ -17,7 +17,7 @@ from torchvo360.solve.status import Status
 State = tuple[Tensor, ...]
 """Parameters, each with the batch as its first axis."""
 
-COST_ROUNDING = 1e-7
+COST_ROUNDING = 1e-6
 """A refused step that promised less than this share of the cost was refused by the rounding of float32 sums."""
 
 GOING_ON = -1

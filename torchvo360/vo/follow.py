@@ -145,6 +145,8 @@ class Follower:
         if self._keyframe_due(found):
             self._new_keyframe(frame, found)
         self.place(frame)
+        if self.foresight.imu is not None:
+            self.foresight.imu.note(frame.t_ns, self.T_map_cam[:3, :3])
         return found
 
     def _bridged(

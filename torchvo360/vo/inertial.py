@@ -5,7 +5,7 @@ velocities and biases follow from them and the IMU together; from then on they a
 poses. Until then the IMU serves by its rotation alone.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import torch
@@ -17,6 +17,7 @@ from torchvo360.alignment import PosePrior
 from torchvo360.checks import InputError, check_finite_number
 from torchvo360.inertial import ImuSensor, predict, preintegrate
 from torchvo360.inertial.initialise import InertialStartConfig, initialise
+from torchvo360.inertial.offset import estimate_offset
 from torchvo360.residuals.inertial import Preintegrated
 from torchvo360.window import Coupling, Metric, Window
 
@@ -25,6 +26,16 @@ BIAS_SIGMA = 2e-3
 START_SIGMA = (0.05, 2e-3, 0.05)
 """Standard deviations of the oldest keyframe's velocity, m/s, gyro bias, rad/s, and accelerometer bias, m/s^2, when a
 window is coupled."""
+MOST_TURNS = 1800
+"""Frames from which the offset of the clocks is estimated, the first of a map: a minute."""
+SURELY = 3.0
+"""Standard deviations by which an offset must differ from the one that was used to take its place."""
+POSE_SIGMA = (3e-4, 2e-4)
+"""Least standard deviations of a keyframe's position, in the map's unit, and rotation, rad, when scale is sought."""
+LOST_SIGMA = 1.0
+"""Of the velocity after the samples had a gap, m/s."""
+METRIC_SIGMA = (0.01, 3e-3, 3e-3)
+"""Of log-scale and the angles of gravity when a map that has them is taken up again."""
 DOUBT = 3.0
 """Scale and gravity are believed this much less than they claim then: the window's own samples are among those that
 told them."""
@@ -49,6 +60,9 @@ class InertialConfig:
     """Longest time without a sample that is integrated over."""
     max_bridge_s: float = 4.0
     """Longest time without a usable image over which the camera is carried by the IMU alone."""
+    estimate_offset: bool = True
+    """Estimate the offset between the camera's and the IMU's clocks from how both turned, and correct it where it is
+    surely not the one given: before a map is coupled, and again whenever twice as much has been seen."""
     rotation_prior: bool = True
     """Hold the rotation of a tracked frame to what the gyro says, as far as that is sure."""
 
@@ -91,6 +105,8 @@ class InertialLink:
         self.sensor, self.config, self._noise = sensor, config, noise
         self.bias = torch.zeros(6, dtype=torch.float64)
         """Of gyro and accelerometer, the last known."""
+        self._turned: list[tuple[int, Float64[Tensor, "3 3"]]] = []
+        self._span_ns = 0
 
     def between(self, times_ns: list[int], bias: Float64[Tensor, "*B 6"]) -> Preintegrated:
         """Return what was measured from each of the camera's times to the next."""
@@ -99,6 +115,28 @@ class InertialLink:
         return preintegrate(
             samples, t[:-1], t[1:], bias[..., :3], bias[..., 3:], noise, max_gap_s=self.config.max_gap_s
         )
+
+    def note(self, t_ns: int, R_world_cam: Float64[Tensor, "3 3"]) -> None:
+        """Note how a frame of the present map was turned, for the offset of the clocks."""
+        if self.config.estimate_offset and len(self._turned) < MOST_TURNS:
+            self._turned.append((t_ns, R_world_cam))
+
+    def begin_map(self) -> None:
+        """Forget what was noted: another map has axes of its own."""
+        self._turned, self._span_ns = [], 0
+
+    def retimed(self) -> bool:
+        """Estimate the offset of the clocks where there is twice as much to tell it; return whether that changed it."""
+        span_ns = self._turned[-1][0] - self._turned[0][0] if self._turned else 0
+        if span_ns < max(2 * self._span_ns, self.config.min_seconds * 1e9):
+            return False
+        self._span_ns = span_ns
+        times, turns = zip(*self._turned, strict=True)
+        found = estimate_offset(torch.stack(turns), torch.tensor(times, dtype=torch.int64), self.sensor)
+        if not found.ok or abs(found.offset_s - self.sensor.offset_s) < SURELY * found.deviation_s:
+            return False
+        self.sensor = replace(self.sensor, offset_s=found.offset_s)
+        return True
 
     # Prediction
 
@@ -168,7 +206,12 @@ class InertialLink:
         if len(times_ns) < self.config.min_keyframes or times_ns[-1] - times_ns[0] < self.config.min_seconds * 1e9:
             return False
         K, config = len(window.frames), self.config
-        settings = InertialStartConfig(max_scale_deviation=config.max_scale_sigma, max_gap_s=config.max_gap_s)
+        settings = InertialStartConfig(
+            position=POSE_SIGMA[0],
+            rotation=POSE_SIGMA[1],
+            max_scale_deviation=config.max_scale_sigma,
+            max_gap_s=config.max_gap_s,
+        )
         start = initialise(T_cam_world, torch.tensor(times_ns, dtype=torch.int64), self.sensor, settings)
         if not start.ok:
             return False
@@ -184,6 +227,36 @@ class InertialLink:
         )
         self.bias = motions[-1, 3:]
         return True
+
+    def recouple(
+        self,
+        window: Window,
+        metric: Metric,
+        velocity: Float64[Tensor, "3"] | None,
+    ) -> None:
+        """Couple a window of one keyframe on a map whose scale and gravity are known.
+
+        Args:
+            window: The window.
+            metric: The map's.
+            velocity: Of the IMU in the map's axes, m/s, as the samples have carried it; None where they have not.
+        """
+        sigma = torch.tensor(START_SIGMA if velocity is not None else (LOST_SIGMA, *START_SIGMA[1:]))
+        at = torch.zeros(3, dtype=torch.float64) if velocity is None else velocity
+        held = torch.tensor(METRIC_SIGMA, dtype=torch.float64)
+        window.couple(
+            Coupling(self.sensor.T_cam_imu, self.sensor.noise, self.config.intensity**2, self.between([0], self.bias)),
+            metric,
+            torch.cat([at, self.bias])[None],
+            1 / torch.cat([sigma.double().repeat_interleave(3), held]).square(),
+        )
+
+    def velocity_at(self, window: Window, key_ns: int, t_ns: int) -> Float64[Tensor, "3"] | None:
+        """Return the velocity that the samples have carried on from a window's newest keyframe; None without them."""
+        segment = self.between([key_ns, t_ns], self._bias_of(window))
+        if window.metric is None or not bool(segment.ok[0]):
+            return None
+        return self.motion_after(window, segment)[:3]
 
 
 def _to_imu(T_cam_world: Tensor, T_cam_imu: Tensor, scale: Tensor) -> Float64[Tensor, "4 4"]:

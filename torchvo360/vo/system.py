@@ -40,7 +40,7 @@ from torchvo360.vo.start.learned import LearnedRanges
 from torchvo360.vo.start.stereo import StereoRanges, check_others, check_rig
 from torchvo360.vo.state import FrameEstimate, State
 from torchvo360.vo.track import Track
-from torchvo360.window import intrinsics_of
+from torchvo360.window import Metric, intrinsics_of
 
 
 @dataclass(frozen=True)
@@ -60,6 +60,10 @@ class OdometryResult:
     """Maps begun; more than one after losses."""
     intrinsics: tuple[float, float, float, float] | None = None
     """(fx, fy, cx, cy) as estimated, pixels; None where they were taken as given."""
+    gravity: tuple[float, float, float] | None = None
+    """In the world's axes, m/s^2, as the IMU told; None without it, or where the motion did not tell."""
+    imu_offset_s: float | None = None
+    """What was added to the IMU's times; None without one."""
 
 
 class VisualOdometry:
@@ -119,6 +123,8 @@ class VisualOdometry:
             stereo = StereoRanges(self._builder, config.map, config.trace, config.window, config.track.min_points)
         self._imu = None if imu is None else InertialLink(imu, config.inertial, config.track.noise)
         self._metric = rig is not None
+        self._metrics: dict[int, Metric] = {}
+        """Scale and gravity by map, as the IMU told."""
         self._starter = Starter(self._builder, config, torch.Generator().manual_seed(seed), learned, stereo)
         self._atlas = Atlas()
         self._follower: Follower | None = None
@@ -164,7 +170,18 @@ class VisualOdometry:
             loops=loops,
             maps=len(atlas.S_world_map),
             intrinsics=self._builder.cameras[0].intrinsics if self.config.window.calibrate else None,
+            gravity=self._gravity(),
+            imu_offset_s=None if self._imu is None else self._imu.sensor.offset_s,
         )
+
+    def _gravity(self) -> tuple[float, float, float] | None:
+        """Return gravity in the world, by the oldest map that knows it."""
+        if not self._metrics:
+            return None
+        map = min(self._metrics)
+        S, gravity = self._atlas.S_world_map[map][:3, :3], self._metrics[map].gravity
+        x, y, z = (S @ gravity * (gravity.norm() / (S @ gravity).norm())).tolist()
+        return x, y, z
 
     def _check(self, frame: Frame) -> None:
         if self._atlas.estimates:
@@ -230,6 +247,8 @@ class VisualOdometry:
         if motion is not None:
             foresight.motion = motion
         mapper.imu = self._imu
+        if self._imu is not None:
+            self._imu.begin_map()
         self._follower = Follower(self._builder, self.config, self._recovery, mapper, foresight, key)
         self._follower.place(frame)
         self._lost = 0
@@ -245,8 +264,9 @@ class VisualOdometry:
         if (begun := self._starter.watch(frame, follower.T_map_cam)) is not None:
             return self._take_over(begun, frame)
         if (metric := follower.mapper.window.metric) is not None:
+            map = self._atlas.sessions[-1].map
+            self._metric, self._metrics[map] = True, metric
             self._atlas.rescale(float(metric.log_scale.exp()))
-            self._metric = True
         joined = [self._atlas.join(edge) for key in follower.left for edge in self._loops.add(key)]
         T_world_cam = self._atlas.in_world(follower.T_map_cam)
         was_lost, self._lost = self._lost > 0, 0
@@ -320,9 +340,7 @@ class VisualOdometry:
         if answer is None:
             return None
         old, found = answer
-        if self._follower is not None:
-            self._retire(self._follower)
-        config = self.config
+        lost, config = self._follower, self.config
         key = carried_keyframe(
             old,
             frame,
@@ -335,10 +353,22 @@ class VisualOdometry:
         )
         metric = self._atlas.mapper_of(old.index).metric
         mapper = Mapper.begun(key, self._builder, self.config, known=True, metric=metric)
-        self._atlas.begin(mapper, map=self._atlas.map_of(old.index), after=old.index)
+        map = self._atlas.map_of(old.index)
+        if self._imu is not None and map in self._metrics:
+            velocity = None if lost is None else self._carried_velocity(self._imu, lost, key)
+            self._imu.recouple(mapper.window, self._metrics[map], velocity)
+        if lost is not None:
+            self._retire(lost)
+        self._atlas.begin(mapper, map=map, after=old.index)
         self._follow_on(mapper, key, frame)
         self._starter.rest()
         return _estimate(frame, self._atlas.in_world(key.T_world_key), State.RELOCALISED, "earlier_keyframe", found)
+
+    def _carried_velocity(self, imu: InertialLink, lost: Follower, key: Keyframe) -> Float64[Tensor, "3"] | None:
+        """Return the velocity that the IMU has carried on from a lost map, in the axes of a keyframe's map."""
+        mapper = lost.mapper
+        velocity = imu.velocity_at(mapper.window, mapper.frames[-1].t_ns, key.frame.t_ns) if lost.carried else None
+        return None if velocity is None else key.T_world_key[:3, :3] @ lost.T_map_cam[:3, :3].mT @ velocity
 
     def _retire(self, follower: Follower) -> None:
         """Keep what a follower leaves: its keyframes, for relocalisation and for loops, and their points."""

@@ -166,6 +166,18 @@ class Window:
         """Return where the keyframes and some points stand."""
         return estimate_of(self.frames, points.rho, self.intrinsics, self.metric)
 
+    def uncouple(self) -> None:
+        """Take the IMU out again: what it said of the poses stays in the prior, all else of it goes."""
+        if self.coupling is None:
+            return
+        assert self.prior is not None
+        layout = self.layout
+        inertial = torch.arange(layout.visual, layout.size)
+        self.prior = Prior(*eliminate(self.prior.H, self.prior.g, inertial))
+        self.frames = [replace(frame, motion=None, motion_first=None) for frame in self.frames]
+        self.coupling = self.metric = None
+        self.first = replace(self.first, metric=None)
+
     @property
     def targets(self) -> list[Target]:
         """The keyframes' images."""

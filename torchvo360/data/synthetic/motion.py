@@ -48,7 +48,14 @@ class Sway:
 
 
 def trajectory(
-    motion: str, walkway: Walkway, frames: int, fps: float, *, seed: int = 0, yaw_jump_deg: float = 0.0
+    motion: str,
+    walkway: Walkway,
+    frames: int,
+    fps: float,
+    *,
+    seed: int = 0,
+    yaw_jump_deg: float = 0.0,
+    at: Float64[Tensor, "N"] | None = None,
 ) -> Float64[Tensor, "N 4 4"]:
     """Return the poses T_world_cam of a motion.
 
@@ -63,6 +70,7 @@ def trajectory(
         fps: Frames a second.
         seed: Start, direction and phases.
         yaw_jump_deg: Extra turn to the left about the vertical inside the two frames at the middle.
+        at: Where on the way from frame to frame, 0.5 between the first two; every frame's by default.
 
     Raises:
         InputError: The motion is another word.
@@ -72,7 +80,7 @@ def trajectory(
     start = math.tau * float(torch.rand((), generator=generator, dtype=torch.float64))
     direction = 1.0 if float(torch.rand((), generator=generator)) < 0.5 else -1.0
     sway = Sway.of(generator)
-    index = torch.arange(frames, dtype=torch.float64)
+    index = torch.arange(frames, dtype=torch.float64) if at is None else at
     time = index / fps
     still = torch.zeros_like(time)
     if motion == "still":
@@ -113,7 +121,9 @@ def trajectory(
             pitch = pitch + 0.12 * nod * torch.sin(math.tau * share)
             roll = roll + 0.06 * nod
     middle = frames // 2
-    yaw = yaw + math.radians(yaw_jump_deg) * ((index - middle + 1) / 2).clamp(0, 1)
+    share = ((index - middle + 1) / 2).clamp(0, 1)
+    smooth = share**3 * (10 - 15 * share + 6 * share**2)  # half way at the frame between, without a kick for an IMU
+    yaw = yaw + math.radians(yaw_jump_deg) * smooth
     return se3(_attitude(yaw, pitch, roll), position)
 
 
@@ -167,12 +177,21 @@ def _circumference(walkway: Walkway) -> float:
 
 
 def _angle_at(walkway: Walkway, start: float, direction: float, distance: Float64[Tensor, "N"]) -> Float64[Tensor, "N"]:
-    """Return the angle gone after a distance along the ellipse, by its arc length at 4096 steps a turn."""
+    """Return the angle gone after a distance along the ellipse, by its arc length at 4096 steps a turn.
+
+    Between the steps it is cubic with the true slope at both ends: its rate has no jumps that an IMU would feel.
+    """
     whole = _circumference(walkway)
     turn = torch.linspace(0, math.tau, 4097, dtype=torch.float64)
     step = torch.linalg.vector_norm(_upright_at(walkway, start + direction * turn).diff(dim=0), dim=-1)
     gone = torch.cat([step.new_zeros(1), step.cumsum(0)])
+    (a, b), angle = walkway.radii, start + direction * turn
+    slope = 1 / torch.hypot(a * angle.sin(), b * angle.cos())
     within = distance % whole
     k = torch.searchsorted(gone, within, right=True).clamp(1, len(gone) - 1)
-    share = (within - gone[k - 1]) / (gone[k] - gone[k - 1])
-    return turn[k - 1] + share * (turn[k] - turn[k - 1]) + math.tau * torch.floor(distance / whole)
+    length = gone[k] - gone[k - 1]
+    share = (within - gone[k - 1]) / length
+    bend_before = slope[k - 1] * length - (turn[k] - turn[k - 1])
+    bend_after = (turn[k] - turn[k - 1]) - slope[k] * length
+    bend = share * (1 - share) * (bend_before * (1 - share) + bend_after * share)
+    return turn[k - 1] + share * (turn[k] - turn[k - 1]) + bend + math.tau * torch.floor(distance / whole)

@@ -2,7 +2,8 @@
 
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from functools import cached_property
 
 import numpy as np
 import torch
@@ -11,12 +12,16 @@ from torch import Tensor
 
 from torchvo360.cameras import Camera, Equirectangular, Pinhole, Rig
 from torchvo360.checks import InputError, check_choice, check_finite_number
-from torchvo360.data.frame import Frame
+from torchvo360.data.frame import Frame, ImageSequence
 from torchvo360.data.synthetic.companion import MOST_SHARE, with_companion
+from torchvo360.data.synthetic.depth import sensed_depth
+from torchvo360.data.synthetic.imu import ImuSetup, SyntheticImu, make_imu
 from torchvo360.data.synthetic.layouts import FIELD, WORLDS, make_world
 from torchvo360.data.synthetic.motion import MOTIONS, trajectory
 from torchvo360.data.synthetic.rays import CameraRays
 from torchvo360.data.trajectory import Trajectory
+from torchvo360.inertial import ImuSensor
+from torchvo360.lie import se3, so3_exp
 
 CAMERAS = ("equirectangular", "pinhole")
 EXPOSURES = ("constant", "steps", "jumps", "drift")
@@ -27,6 +32,8 @@ MIN_BASELINE, MAX_BASELINE = 1e-3, 0.4
 """Shortest and longest distance of two cameras, metres: the second too keeps clear of what stands beside the path."""
 MAX_SEED = 2**32 - 1
 """Largest seed: with the number of a frame it still makes a seed of 64 bits."""
+MIN_IMU_HZ, MAX_IMU_HZ = 20.0, 2000.0
+MAX_OFFSET_MS = 300.0
 STEP_FRAMES = 20
 """Frames between two steps of the exposure."""
 
@@ -69,6 +76,26 @@ class SyntheticConfig:
     """Distance of a second camera of the same kind from the first, metres; 0 for a single camera."""
     stereo_axis: str = "x"
     """Where the second camera is, in the first one's frame: x, to the right, or y, below."""
+    depth_noise: float | None = None
+    """Noise of a depth sensor beside the camera, as a share of each range; None without one."""
+    depth_holes: float = 0.0
+    """Share of the image in which that sensor knows nothing, in blobs."""
+    imu_rate: float = 0.0
+    """Samples a second of an IMU that is fixed to the camera; 0 for none."""
+    imu_noise: float = 1.0
+    """White noise and random walk of its biases, times those of EuRoC's IMU."""
+    imu_bias: float = 1.0
+    """Its first biases, drawn with standard deviations of this times 0.03 rad/s and 0.08 m/s^2."""
+    imu_lever: list[float] = field(default_factory=lambda: [0.06, -0.04, 0.03])
+    """Where it is in the camera's frame, metres."""
+    imu_turn_deg: list[float] = field(default_factory=lambda: [5.0, -85.0, 10.0])
+    """How it is turned in the camera's frame: a rotation vector, degrees."""
+    imu_offset_ms: float = 0.0
+    """What to add to its times to get the camera's; the sequence does not tell."""
+    imu_gap_s: float = 0.0
+    """How long it gives no samples at the middle of the sequence, seconds."""
+    blackout_s: float = 0.0
+    """How long the images are black at the middle of the sequence, seconds."""
     panorama: str | None = None
     """Path of an equirectangular image that the walls wear, or the sky of the courtyard; None for procedural looks."""
 
@@ -97,11 +124,32 @@ class SyntheticConfig:
             raise InputError(f"moving_share: expected 0 with a second camera, got {self.moving_share!r}.")
         if not abs(self.yaw_jump_deg) <= 180:
             raise InputError(f"yaw_jump_deg: expected a finite number from -180 to 180, got {self.yaw_jump_deg!r}.")
+        self._check_imu()
+        if self.depth_noise is not None and not 0 <= self.depth_noise <= 1:
+            raise InputError(f"depth_noise: expected None or a number from 0 to 1, got {self.depth_noise!r}.")
+        if not 0 <= self.depth_holes <= 1:
+            raise InputError(f"depth_holes: expected a share from 0 to 1, got {self.depth_holes!r}.")
         if not (math.isfinite(self.noise) and 0 <= self.noise <= 1):
             raise InputError(f"noise: expected a number from 0 to 1, got {self.noise!r}.")
 
+    def _check_imu(self) -> None:
+        if not (self.imu_rate == 0 or MIN_IMU_HZ <= self.imu_rate <= MAX_IMU_HZ):
+            expected = f"0 or a number from {MIN_IMU_HZ:g} to {MAX_IMU_HZ:g}"
+            raise InputError(f"imu_rate: expected {expected}, got {self.imu_rate!r}.")
+        for name in ("imu_noise", "imu_bias", "imu_gap_s", "blackout_s"):
+            value = getattr(self, name)
+            if not (math.isfinite(value) and value >= 0):
+                raise InputError(f"{name}: expected a finite number of at least 0, got {value!r}.")
+        if not abs(self.imu_offset_ms) <= MAX_OFFSET_MS:
+            expected = f"a number from {-MAX_OFFSET_MS:g} to {MAX_OFFSET_MS:g}"
+            raise InputError(f"imu_offset_ms: expected {expected}, got {self.imu_offset_ms!r}.")
+        for name in ("imu_lever", "imu_turn_deg"):
+            value = getattr(self, name)
+            if len(value) != 3 or not all(math.isfinite(number) for number in value):
+                raise InputError(f"{name}: expected three finite numbers, got {value!r}.")
 
-class SyntheticSequence:
+
+class SyntheticSequence(ImageSequence):
     """An image sequence rendered on demand; `truth`, `pose` and `range` are exact, and the first camera's.
 
     A frame is the world's colour times the frame's gain plus its offset plus noise, clipped to [0, 1], in 8 bits.
@@ -118,29 +166,73 @@ class SyntheticSequence:
         self.world = make_world(
             config.world, seed=config.seed, panorama=config.panorama, moving_objects=config.moving_objects
         )
-        self.camera: Camera = _camera(config)
-        self.rig: Rig | None = _rig(config, self.camera)
-        """The stereo pair, its body the first camera; None for a single camera."""
-        self._rays = CameraRays.of(self.camera)
-        self.name = f"synthetic_{config.world}"
+        self._camera = _camera(config)
+        self._rig = _rig(config, self._camera)
+        self._rays = CameraRays.of(self._camera)
         t_ns = (torch.arange(config.frames, dtype=torch.float64) * (1e9 / config.fps)).round().long()
-        poses = trajectory(
+        poses = self._poses()
+        self._truth = Trajectory(t_ns, poses)
+        if config.moving_share > 0:
+            self.world = with_companion(self.world, poses, config.fps, config.moving_share, config.seed)
+        self.gains, self.offsets = _exposure(config)
+
+    @property
+    def name(self) -> str:
+        return f"synthetic_{self.config.world}"
+
+    @property
+    def camera(self) -> Camera:
+        return self._camera
+
+    @property
+    def length(self) -> int:
+        return self.config.frames
+
+    @property
+    def truth(self) -> Trajectory:
+        return self._truth
+
+    @property
+    def rig(self) -> Rig | None:
+        """The stereo pair, its body the first camera; None for a single camera."""
+        return self._rig
+
+    @property
+    def imu(self) -> ImuSensor | None:
+        return None if self.synthetic_imu is None else self.synthetic_imu.sensor
+
+    @cached_property
+    def synthetic_imu(self) -> SyntheticImu | None:
+        """The IMU with its true biases and offset; None without one."""
+        config = self.config
+        if config.imu_rate == 0:
+            return None
+        setup = ImuSetup(
+            se3(
+                so3_exp(torch.deg2rad(torch.tensor(config.imu_turn_deg, dtype=torch.float64))),
+                torch.tensor(config.imu_lever, dtype=torch.float64),
+            ),
+            rate_hz=config.imu_rate,
+            noise=config.imu_noise,
+            bias=config.imu_bias,
+            offset_s=config.imu_offset_ms / 1e3,
+            gap_s=config.imu_gap_s,
+            seed=config.seed + 2,
+        )
+        return make_imu(lambda time: self._poses(time * config.fps), (config.frames - 1) / config.fps, setup)
+
+    def _poses(self, at: Float64[Tensor, "N"] | None = None) -> Float64[Tensor, "N 4 4"]:
+        """Return T_world_cam of all frames, or anywhere between them."""
+        config = self.config
+        return trajectory(
             config.motion,
             self.world.walkway,
             config.frames,
             config.fps,
             seed=config.seed,
             yaw_jump_deg=config.yaw_jump_deg,
+            at=at,
         )
-        self.truth = Trajectory(t_ns, poses)
-        if config.moving_share > 0:
-            self.world = with_companion(self.world, poses, config.fps, config.moving_share, config.seed)
-        self.gains, self.offsets = _exposure(config)
-
-    @property
-    def length(self) -> int:
-        """The number of frames."""
-        return self.config.frames
 
     def __len__(self) -> int:
         return self.config.frames
@@ -172,13 +264,21 @@ class SyntheticSequence:
         Raises:
             InputError: The index is not one of the sequence.
         """
-        T_world_first = self.pose(index)
+        T_world_first, t_ns = self.pose(index), int(self.truth.t_ns[index])
+        if abs(index - (len(self) - 1) / 2) / self.config.fps < self.config.blackout_s / 2:
+            black = np.zeros((self.config.height, self.config.width, 3), np.uint8)
+            others = () if self.rig is None else (black,) * (len(self.rig.cameras) - 1)
+            return Frame(index, t_ns, black, "black", others=others)
         generator = torch.Generator().manual_seed(self.config.seed * 1_000_003 + index)
-        image = self._expose(index, self._render(index, T_world_first)[0], generator)
+        colour, reach = self._render(index, T_world_first)
+        image = self._expose(index, colour, generator)
         others = () if self.rig is None else self.rig.T_body_cam[1:]
         looks = (self._render(index, T_world_first @ T_first_other)[0] for T_first_other in others)
         further = tuple(self._expose(index, colour, generator) for colour in looks)
-        return Frame(index, int(self.truth.t_ns[index]), image, others=further)
+        depth, noise = None, self.config.depth_noise
+        if noise is not None:
+            depth = sensed_depth(reach, noise, self.config.depth_holes, self.config.seed * 1_000_003 + index)
+        return Frame(index, t_ns, image, others=further, depth=depth)
 
     def _expose(
         self, index: int, colour: Float[Tensor, "3 H W"], generator: torch.Generator

@@ -1,4 +1,4 @@
-"""Fresh points of a keyframe: pixels chosen evenly over the sphere, by a depth sensor, or traced into earlier frames."""
+"""Fresh points of a keyframe: pixels spread evenly over the sphere, with a sensor's ranges or traced into others."""
 
 import math
 from dataclasses import replace

@@ -135,7 +135,7 @@ class Mapper:
         others.insert(0, others.pop(len(others) // 2))
         self._freshen(place, others)
         self._adjust()
-        if self.imu is not None and self.window.coupling is None and self._coupled(self.imu):
+        if self.imu is not None and self._coupled(self.imu):
             self._adjust()
         self._cull()
         left = []
@@ -145,7 +145,11 @@ class Mapper:
         return left
 
     def _coupled(self, imu: InertialLink) -> bool:
-        """Couple the window with the IMU, if the keyframes so far tell the scale."""
+        """Couple the window with the IMU, if the keyframes so far tell the scale; again where its times were wrong."""
+        if imu.retimed():
+            self.window.uncouple()
+        if self.window.coupling is not None:
+            return False
         poses = self.poses()
         keys = sorted(poses)[-MOST_COUPLED:]
         T_cam_world = lie.se3_inverse(torch.stack([poses[key] for key in keys]))

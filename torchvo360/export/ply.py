@@ -77,4 +77,4 @@ def read_ply(path: str | Path) -> tuple[Float[Tensor, "N 3"], UInt8[Tensor, "N 3
     if len(body) != count * VERTEX.itemsize:
         raise InputError(f"{path}: expected {count} points, got {len(body) // VERTEX.itemsize}: the file is cut off.")
     vertices = np.frombuffer(body, VERTEX)
-    return tuple(torch.from_numpy(np.ascontiguousarray(vertices[name])) for name in ("xyz", "rgb", "frame"))  # pyright: ignore[reportReturnType]
+    return tuple(torch.from_numpy(vertices[name].copy(order="C")) for name in ("xyz", "rgb", "frame"))  # pyright: ignore[reportReturnType]

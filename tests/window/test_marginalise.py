@@ -11,8 +11,8 @@ from torchvo360 import lie
 from torchvo360.solve.schur import reduce
 from torchvo360.window import WindowConfig
 from torchvo360.window.energy import linearize_window
-from torchvo360.window.prior import Prior, eliminate
 from torchvo360.window.layout import Layout
+from torchvo360.window.prior import Prior, eliminate
 from torchvo360.window.state import PER_FRAME
 from torchvo360.window.system import LEAST_CURVATURE
 

@@ -1,0 +1,133 @@
+"""With an IMU a single camera knows metres and the vertical, and goes on where its images fail."""
+
+import math
+from dataclasses import replace
+
+import pytest
+import torch
+from torch import Tensor
+
+from torchvo360 import lie
+from torchvo360.data.registration import similarity_from_points
+from torchvo360.data.synthetic import SyntheticConfig, SyntheticSequence
+from torchvo360.evaluation import evaluate
+from torchvo360.inertial import ImuSamples, ImuSensor
+from torchvo360.vo import FrameEstimate, OdometryConfig, OdometryResult, State, VisualOdometry
+
+WALK = {"width": 256, "height": 128, "frames": 200, "imu_rate": 200.0}
+PINHOLE = {"camera": "pinhole", "width": 320, "height": 240}
+CONFIG = OdometryConfig(blur_px=0.5)
+DOWN = torch.tensor([0.0, 0.0, -1.0], dtype=torch.float64)
+
+
+class Journey:
+    """A synthetic walk with an IMU, gone through."""
+
+    def __init__(self, sensor: ImuSensor | None = None, **settings: object) -> None:
+        self.sequence = SyntheticSequence(SyntheticConfig(**{**WALK, **settings}))  # type: ignore[arg-type]
+        sensor = self.sequence.imu if sensor is None else sensor
+        odometry = VisualOdometry(self.sequence.camera, CONFIG, imu=sensor)
+        self.online: list[FrameEstimate] = [odometry.step(frame) for frame in self.sequence]
+        self.result: OdometryResult = odometry.finish()
+
+    @property
+    def scale_error(self) -> float:
+        return abs(evaluate(self.result.trajectory, self.sequence.truth).scale - 1)
+
+    @property
+    def gravity_error_deg(self) -> float:
+        """Against the vertical as the first camera truly sees it."""
+        assert self.result.gravity is not None
+        gravity = torch.tensor(self.result.gravity, dtype=torch.float64)
+        down = self.sequence.pose(0)[:3, :3].mT @ DOWN
+        return math.degrees(math.acos(min(1.0, float(down @ gravity / gravity.norm()))))
+
+    def errors_m(self) -> Tensor:
+        """Of all final positions, in metres: without a scale of one's own."""
+        found, true = self.result.trajectory.positions, self.sequence.truth.positions
+        T = similarity_from_points(found, true, with_scale=False)
+        assert T is not None
+        return torch.linalg.vector_norm(found @ T[:3, :3].mT + T[:3, 3] - true, dim=-1)
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [{"world": "room", "seed": 0}, {"world": "courtyard", "seed": 5}, {"world": "room", "seed": 4, **PINHOLE}],
+    ids=["room", "courtyard", "pinhole"],
+)
+def test_a_single_camera_knows_metres_and_the_vertical(settings):
+    journey = Journey(**settings)
+    assert journey.scale_error < 0.015
+    assert journey.gravity_error_deg < 0.5
+    assert float(journey.errors_m().square().mean().sqrt()) < 0.006 * journey.sequence.truth.path_length
+    assert journey.result.maps == 1
+
+
+def test_two_seconds_without_images_are_bridged_to_a_few_centimetres():
+    journey = Journey(world="pillars", seed=1, blackout_s=2.0, frames=240)
+    black = [at for at, estimate in enumerate(journey.online) if estimate.reason == "bad_frame_black"]
+    assert len(black) == 60
+    assert {journey.online[at].state for at in black} == {State.WEAK}
+    assert float(journey.errors_m()[black].max()) < 0.05
+    assert journey.result.maps == 1
+    assert journey.online[black[-1] + 1].state == State.TRACKING
+    # As they were given out, too: by how far the camera went meanwhile.
+    gone = journey.online[black[-1]].T_world_cam[:3, 3] - journey.online[black[0]].T_world_cam[:3, 3]
+    true = journey.sequence.pose(black[-1])[:3, 3] - journey.sequence.pose(black[0])[:3, 3]
+    assert abs(float(gone.norm() - true.norm())) < 0.1
+
+
+def test_a_second_without_samples_is_survived():
+    journey = Journey(world="room", seed=3, imu_gap_s=1.0)
+    assert journey.scale_error < 0.015
+    assert journey.result.maps == 1
+    assert {estimate.state for estimate in journey.online} <= {State.INITIALISING, State.TRACKING}
+
+
+def test_an_offset_of_the_clocks_is_found():
+    journey = Journey(world="pillars", seed=1, imu_offset_ms=-40.0)
+    assert journey.result.imu_offset_s == pytest.approx(-0.04, abs=1e-3)
+    assert journey.scale_error < 0.015
+
+
+def test_samples_that_end_early_leave_the_images_to_themselves():
+    sequence = SyntheticSequence(SyntheticConfig(**{**WALK, "world": "room", "seed": 0, "frames": 60}))
+    whole = sequence.imu
+    assert whole is not None
+    few = ImuSamples(*(part[:60].clone() for part in (whole.samples.t_ns, whole.samples.gyro, whole.samples.accel)))
+    journey = Journey(replace(whole, samples=few), world="room", seed=0, frames=60)
+    assert journey.result.gravity is None
+    assert {estimate.state for estimate in journey.online} == {State.INITIALISING, State.TRACKING}
+    assert evaluate(journey.result.trajectory, journey.sequence.truth).ate_percent < 0.2
+
+
+def test_a_walk_that_tells_no_scale_is_left_without_one():
+    """A camera that only turns: nothing may be made up."""
+    journey = Journey(world="room", seed=0, motion="rotation", frames=90)
+    assert journey.result.gravity is None
+
+
+def test_the_answer_is_the_same_every_time():
+    first, second = (Journey(world="room", seed=0, frames=90) for _ in range(2))
+    assert torch.equal(first.result.trajectory.T_world_cam, second.result.trajectory.T_world_cam)
+    assert first.result.gravity == second.result.gravity
+    assert first.result.gravity is not None
+
+
+def test_images_of_an_earlier_place_are_found_there_in_metres():
+    """The images jump back, which the IMU does not: they are found in an earlier keyframe, whose scale goes on."""
+    sequence = SyntheticSequence(SyntheticConfig(**{**WALK, "world": "room", "seed": 0, "frames": 150}))
+    odometry = VisualOdometry(
+        sequence.camera, replace(CONFIG, inertial=replace(CONFIG.inertial, max_bridge_s=0.2)), imu=sequence.imu
+    )
+    frames = list(sequence)
+    order = [*range(110), *range(60, 80)]
+    estimates = []
+    for place, number in enumerate(order):
+        frame = replace(frames[number], index=place, t_ns=frames[place].t_ns)
+        estimates.append(odometry.step(frame))
+    result = odometry.finish()
+    assert any(estimate.reason == "earlier_keyframe" for estimate in estimates)
+    last, true = result.trajectory.T_world_cam[-1], sequence.pose(0)
+    moved = lie.se3_inverse(true) @ sequence.pose(order[-1])
+    assert float((last[:3, 3] - moved[:3, 3]).norm()) < 0.1

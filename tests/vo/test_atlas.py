@@ -261,7 +261,9 @@ def test_the_points_of_a_joined_map_have_the_first_one_s_unit():
         for key, T in session.mapper.poses().items():
             S_key_world = lie.sim3_inverse(S @ T)
             xyz = p_world @ S_key_world[:3, :3].mT + S_key_world[:3, 3]
-            session.mapper.clouds[key] = PointCloud(xyz.float(), torch.zeros(1, 3, dtype=torch.uint8), torch.tensor([key]).int())
+            session.mapper.clouds[key] = PointCloud(
+                xyz.float(), torch.zeros(1, 3, dtype=torch.uint8), torch.tensor([key]).int()
+            )
     atlas.join(between_maps(atlas, 3, 15, true))
     cloud = atlas.points(atlas.keyframes())
     torch.testing.assert_close(cloud.xyz, p_world.float().expand(20, 3), rtol=0, atol=1e-5)

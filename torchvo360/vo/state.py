@@ -42,3 +42,6 @@ class FrameEstimate:
     """Offset of the frame against its keyframe, intensities."""
     milliseconds: float
     """Time the step took."""
+    covariance: Float64[Tensor, "6 6"] | None = None
+    """Of the left error (v, w) of T_cam_world against the keyframe's, by the alignment's own residuals, in the unit of
+    the frame's map; None where the frame was not tracked."""

@@ -35,6 +35,7 @@ from torchvo360.vo.keyframes.mapper import Mapper
 from torchvo360.vo.loops import LoopCloser, LoopEdge
 from torchvo360.vo.recover import Recovery
 from torchvo360.vo.sensor import check_depth
+from torchvo360.vo.smooth import smoothed
 from torchvo360.vo.start.begin import Begun, Starter
 from torchvo360.vo.start.learned import LearnedRanges
 from torchvo360.vo.start.stereo import StereoRanges, check_others, check_rig
@@ -161,6 +162,10 @@ class VisualOdometry:
         before = atlas.keyframes()
         after = atlas.corrected(loops, self.config.loop.graph, metric=self._metric)
         frames, earlier = atlas.final(after), atlas.final(before)
+        if self.config.smooth:
+            scales = {key: float(torch.linalg.det(S[:3, :3]).pow(1 / 3)) for key, S in after.items()}
+            by_frame = {index: scales[key] for index, (key, _) in atlas.anchors.items() if key in scales}
+            frames = smoothed(frames, by_frame, self.config.motion)
         return OdometryResult(
             frames=frames,
             trajectory=_trajectory(frames),
@@ -391,4 +396,5 @@ def _estimate(
     nan = math.nan
     residual, inliers = (nan, nan) if found is None else (found.residual, found.inliers)
     a, b = (nan, nan) if found is None else (float(found.affine[0]), float(found.affine[1]))
-    return FrameEstimate(frame.index, frame.t_ns, T_world_cam, state, reason, residual, inliers, a, b, 0.0)
+    covariance = None if found is None else found.covariance
+    return FrameEstimate(frame.index, frame.t_ns, T_world_cam, state, reason, residual, inliers, a, b, 0.0, covariance)

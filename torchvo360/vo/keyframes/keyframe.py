@@ -7,6 +7,7 @@ from jaxtyping import Bool, Float, Float64, Int64
 from torch import Tensor
 
 from torchvo360 import lie
+from torchvo360.cameras import Camera
 from torchvo360.checks import InputError, check_finite_number
 from torchvo360.depth import InverseRange
 from torchvo360.image import equal_area_cells, one_per_cell, select_pixels
@@ -78,6 +79,12 @@ class KeyPoints:
         Y = T[:3, :3] @ self.ray + self.points.rho * T[:3, 3:]
         inv_length = Y.square().sum(0).clamp_min(1e-24).rsqrt()
         return Y * inv_length, self.points.rho * inv_length
+
+    def share_in_view(self, T_cam_key: Float64[Tensor, "4 4"], camera: Camera) -> float:
+        """Return which share of the points in use another camera has in view; 1 without points."""
+        used = self.points.score > 0
+        _, seen = camera.project(self.moved(T_cam_key)[0].T)
+        return float(seen[used].double().mean()) if bool(used.any()) else 1.0
 
     def mean_flow(self, T_cam_key: Float64[Tensor, "4 4"]) -> float:
         """Return the mean angle by which the translation moves the points in use, radians; 0 without points."""

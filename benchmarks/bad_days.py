@@ -138,7 +138,7 @@ def _read_images(images: Images, numbers: Sequence[int]) -> Iterator[Frame]:
         while end < len(numbers) and numbers[end] >= numbers[end - 1]:
             end += 1
         wanted = numbers[begin:end]
-        passing = iter(Images(images.source, images.view, Selection(wanted[0], wanted[-1] + 1, 1)))
+        passing = iter(Images(images.source, images.fit, Selection(wanted[0], wanted[-1] + 1, 1)))
         at, frame = wanted[0], next(passing)
         for number in wanted:
             while at < number:

@@ -64,20 +64,20 @@ def main() -> None:
     torch.set_num_threads(1)
     cv2.setNumThreads(1)
     print(f"{'':40} seed  scale %  ATE mm   ATE %  rot deg          states    fps")
-    for camera, blind in itertools.product(CAMERAS, (range(0), BLIND)):
-        for world, seed in itertools.product(WORLDS, arguments.seeds):
-            width, height = CAMERAS[camera]
-            settings = SyntheticConfig(
-                camera=camera,
-                world=world,
-                seed=seed,
-                frames=arguments.frames,
-                width=width,
-                height=height,
-                depth_noise=0.01,
-                depth_holes=0.4,
-            )
-            print(measure(f"{camera}, {world}{', blind' if blind else ''}", settings, blind), flush=True)
+    for (camera, (width, height)), blind in itertools.product(CAMERAS.items(), (range(0), BLIND)):
+        for world in WORLDS:
+            for seed in arguments.seeds:
+                settings = SyntheticConfig(
+                    camera=camera,
+                    world=world,
+                    seed=seed,
+                    frames=arguments.frames,
+                    width=width,
+                    height=height,
+                    depth_noise=0.01,
+                    depth_holes=0.4,
+                )
+                print(measure(f"{camera}, {world}{', blind' if blind else ''}", settings, blind), flush=True)
 
 
 if __name__ == "__main__":

@@ -7,9 +7,21 @@ from dataclasses import replace
 
 import pytest
 import torch
-from rgbd import CONFIG, GAIN, METHODS, OFFSET, Method, Pair, Prepared, ours, ours_widely, recorded_pairs, synthetic_pairs
 from torch import Tensor
 
+from rgbd import (
+    CONFIG,
+    GAIN,
+    METHODS,
+    OFFSET,
+    Method,
+    Pair,
+    Prepared,
+    ours,
+    ours_widely,
+    recorded_pairs,
+    synthetic_pairs,
+)
 from torchvo360 import lie
 from torchvo360.alignment import AlignConfig, align, match_brightness
 from torchvo360.data.synthetic import SyntheticConfig, SyntheticSequence, sample_pairs

@@ -25,9 +25,7 @@ MAX_LOG_GAIN = 10.0
 """Exposures differ by less than e to this power, fourteen stops."""
 
 
-def match_brightness(
-    reference: Reference, target: Target, T_tgt_ref: Float[Tensor, "B 4 4"]
-) -> Float[Tensor, "B 2"]:
+def match_brightness(reference: Reference, target: Target, T_tgt_ref: Float[Tensor, "B 4 4"]) -> Float[Tensor, "B 2"]:
     """Return (a, b) that give the reference's points the mean and spread of what the target shows at their places.
 
     The places are those of the start. It need not be close: where the same things are in view, moments are much the

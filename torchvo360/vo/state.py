@@ -28,7 +28,8 @@ class FrameEstimate:
     index: int
     t_ns: int
     T_world_cam: Float64[Tensor, "4 4"]
-    """The world is the first frame's camera; its unit the first keyframe's median range, or a depth network's metre."""
+    """The world is the first frame's camera; its unit the first keyframe's median range, or the metre of
+    what knows it: a rig, a depth sensor, a depth network, an IMU."""
     state: State
     reason: str
     """Why the state is what it is, in words a program can compare: ok, low_parallax, bad_frame_black, ..."""

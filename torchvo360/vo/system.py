@@ -138,8 +138,8 @@ class VisualOdometry:
         A frame with a problem gets a predicted pose. While there is no map the pose is a rotation.
 
         Raises:
-            InputError: The image is not of the camera's size, or index or time do not increase, or the depth network
-                does not give ranges.
+            InputError: The image or the depth image is not of the camera's size, or index or time do not increase, or
+                the depth network does not give ranges.
         """
         began = time.perf_counter()
         self._check(frame)

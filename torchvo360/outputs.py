@@ -1,4 +1,4 @@
-"""What a run leaves: a folder with trajectory, frames, map, picture, figures and settings, and a few closing lines."""
+"""What a run leaves: a folder with trajectory, frames, map, report, figures and settings, and a few closing lines."""
 
 import csv
 import importlib.metadata
@@ -9,7 +9,7 @@ import math
 import platform
 import tempfile
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass
 from datetime import datetime
@@ -28,11 +28,24 @@ from torchvo360.evaluation import Evaluation
 from torchvo360.export import write_ply, write_tum
 from torchvo360.files import atomic_path
 from torchvo360.settings import RunConfig
-from torchvo360.viz import plot_trajectory
+from torchvo360.viz import plot_errors, plot_trajectory
+from torchvo360.viz.report import Content, Picture, write_report
 from torchvo360.vo import FrameEstimate, OdometryResult
 
 BEFORE_LOOPS = "trajectory_before_loops.txt"
-FILES = ("trajectory.txt", BEFORE_LOOPS, "frames.csv", "map.ply", "trajectory.png", "config.yaml", "summary.json")
+RECORDING = "run.rrd"
+FILES = (
+    RECORDING,
+    "trajectory.txt",
+    BEFORE_LOOPS,
+    "frames.csv",
+    "map.ply",
+    "trajectory.png",
+    "errors.png",
+    "report.html",
+    "config.yaml",
+    "summary.json",
+)
 """In the order in which they are written: where there is a summary, the run is complete."""
 
 COLUMNS = ("index", "time", "state", "reason", "residual", "inliers", "a", "b", "milliseconds")
@@ -57,6 +70,10 @@ class Record:
     truth: Trajectory | None
     evaluation: Evaluation | None
     notes: list[str]
+    metric: bool = False
+    """Whether the estimate's unit is the metre."""
+    pictures: Sequence[Picture] = ()
+    """Of frames, for the report."""
 
 
 def can_plot() -> bool:
@@ -132,25 +149,50 @@ def write_all(folder: Path, record: Record) -> dict[str, Any]:
         write_tum(folder / BEFORE_LOOPS, result.before_loops)
         _write_frames(folder / "frames.csv", result.frames)
         write_ply(folder / "map.ply", result.points.xyz, result.points.rgb, result.points.frame)
+        left_out = {"trajectory.png", "errors.png", "report.html"}  # an overwritten run's
+        if config.viz == "none":
+            left_out.add(RECORDING)
         if draw:
-            with atomic_path(folder / "trajectory.png") as temporary:
-                states = [str(frame.state) for frame in result.frames]
-                truth = record.truth if record.evaluation else None
-                plot_trajectory(
-                    temporary,
-                    result.trajectory,
-                    truth=truth,
-                    points=result.points,
-                    states=states,
-                    title=record.name,
-                )
-        else:
-            (folder / "trajectory.png").unlink(missing_ok=True)  # an overwritten run's
+            left_out -= _draw(folder, record)
+        if config.report:
+            _write_report(folder / "report.html", record, summary)
+            left_out.remove("report.html")
+        for name in left_out:
+            (folder / name).unlink(missing_ok=True)
         _write_text(folder / "config.yaml", record.config_yaml)
         _write_text(folder / "summary.json", json.dumps(summary, indent=2, allow_nan=False) + "\n")
     except OSError as error:
         raise InputError(f"out: expected a folder that can be written, got {folder}: {error.strerror}.") from None
     return summary
+
+
+def _draw(folder: Path, record: Record) -> set[str]:
+    """Draw the pictures and return their names."""
+    trajectory = record.result.trajectory
+    states = [str(frame.state) for frame in record.result.frames]
+    truth = record.truth if record.evaluation else None
+    points = record.result.points
+    with atomic_path(folder / "trajectory.png") as temporary:
+        plot_trajectory(temporary, trajectory, truth=truth, points=points, states=states, title=record.name)
+    if truth is None:
+        return {"trajectory.png"}
+    with atomic_path(folder / "errors.png") as temporary:
+        plot_errors(temporary, trajectory, truth, states=states, title=record.name)
+    return {"trajectory.png", "errors.png"}
+
+
+def _write_report(path: Path, record: Record, summary: dict[str, Any]) -> None:
+    content = Content(
+        name=record.name,
+        camera=record.camera,
+        result=record.result,
+        summary=summary,
+        truth=record.truth if record.evaluation else None,
+        metric=record.metric or record.result.gravity is not None,
+        pictures=record.pictures,
+        defaults=asdict(RunConfig()),
+    )
+    write_report(path, content, most_bytes=round(1e6 * record.config.report_mb))
 
 
 def summarise(record: Record) -> dict[str, Any]:
@@ -211,7 +253,8 @@ def describe(summary: dict[str, Any], folder: Path) -> list[str]:
         figures += ["coverage", "fps"]
         width = max(map(len, figures))
         lines += [f"{name:<{width}}  {_figure(summary[name])}" for name in figures]
-    return [*lines, *(f"note: {note}" for note in summary["notes"]), f"results: {folder}"]
+    report = [f"report: {folder / 'report.html'}"] * summary["settings"]["report"]
+    return [*lines, *(f"note: {note}" for note in summary["notes"]), *report, f"results: {folder}"]
 
 
 def _figure(value: float | None) -> str:

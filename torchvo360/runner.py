@@ -23,9 +23,17 @@ from torchvo360.evaluation import evaluate
 from torchvo360.learn.checkpoint import SHIPPED_DEPTH, load_checkpoint
 from torchvo360.learn.plugin import DepthEstimator, build
 from torchvo360.opening import Opened, open_input
-from torchvo360.outputs import Record, can_plot, describe, output_folder, write_all
+from torchvo360.outputs import RECORDING, Record, can_plot, describe, output_folder, write_all
 from torchvo360.settings import SHIPPED, DepthConfig, RunConfig
+from torchvo360.viz.live import MAP_EVERY, LiveView, can_record, live_view
+from torchvo360.viz.report.page import picture_budget
+from torchvo360.viz.report.pictures import Pictures
 from torchvo360.vo import LEARNED, VisualOdometry
+
+NOT_COUPLED = (
+    "it told rotations at most, neither scale nor gravity: the camera moved too little or for less than about two "
+    "seconds, or the samples' unit, their clock or T_cam_imu is not what was said."
+)
 
 
 @dataclass(frozen=True)
@@ -85,6 +93,8 @@ def run(config: RunConfig, *, config_yaml: str = "") -> Outcome:
         raise InputError("device: expected cpu, as PyTorch finds no CUDA device here, got cuda.")
     if config.plot == "true" and not can_plot():
         raise InputError("plot: expected matplotlib, which pip install 'torchvo360[viz]' brings, or plot=false.")
+    if config.viz != "none" and not can_record():
+        raise InputError("viz: expected rerun-sdk, which pip install 'torchvo360[live]' brings, or viz=none.")
     opened = open_input(config)
     sequence, notes = opened.sequence, opened.notes
     truth = sequence.truth if config.truth is None else _read_truth(config.truth)
@@ -94,6 +104,7 @@ def run(config: RunConfig, *, config_yaml: str = "") -> Outcome:
         _threads(config.threads),
         torch.inference_mode(),
         StopSignals() as stop,
+        live_view(config.viz, folder / RECORDING, sequence.name, sequence.camera) as live,
     ):
         depth = None if depth is None else depth.to(config.device)
         odometry = VisualOdometry(
@@ -106,7 +117,16 @@ def run(config: RunConfig, *, config_yaml: str = "") -> Outcome:
             rig=sequence.rig,
             imu=opened.imu,
         )
-        journey = _step_through(opened, odometry, truth, stop, config.progress)
+        pictures = Pictures(picture_budget(round(1e6 * config.report_mb)), length=sequence.length)
+        journey = _step_through(
+            opened,
+            odometry,
+            truth,
+            stop,
+            progress=config.progress,
+            pictures=pictures if config.report else None,
+            live=live,
+        )
         if journey.usable < 2 and stop.received:
             return Outcome([], "stopped before two frames were done: nothing is written.", 128 + stop.received)
         if journey.usable < 2:
@@ -118,8 +138,12 @@ def run(config: RunConfig, *, config_yaml: str = "") -> Outcome:
             of = f" of {sequence.length}" if sequence.length else ""
             notes.append(f"stopped by {stop.received.name} after {journey.frames}{of} frames; they are kept.")
         result = odometry.finish()
+        if live is not None:
+            live.finish(result)
         if depth is not None and not any(estimate.reason == LEARNED for estimate in result.frames):
             notes.append("depth: the network was sure of too little of what it saw, so that the unit is not its metre.")
+        if opened.imu is not None and result.gravity is None:
+            notes.append(f"imu: {NOT_COUPLED}")
         evaluation, complaint = None, ""
         if truth is not None:
             try:
@@ -137,6 +161,8 @@ def run(config: RunConfig, *, config_yaml: str = "") -> Outcome:
             truth=truth,
             evaluation=evaluation,
             notes=notes,
+            metric=depth is not None or sequence.rig is not None or journey.has_depth,
+            pictures=pictures.kept,
         )
         lines = describe(write_all(folder, record), folder)
         return Outcome(lines, complaint, 128 + stop.received if stop.received else 2 if complaint else 0)
@@ -150,6 +176,8 @@ class Journey:
     problems: Counter[str]
     """Of the frames that could not be used."""
     seconds: float
+    has_depth: bool
+    """Whether a sensor's ranges came with the frames."""
 
     @property
     def usable(self) -> int:
@@ -158,13 +186,20 @@ class Journey:
 
 
 def _step_through(
-    opened: Opened, odometry: VisualOdometry, truth: Trajectory | None, stop: StopSignals, progress: bool
+    opened: Opened,
+    odometry: VisualOdometry,
+    truth: Trajectory | None,
+    stop: StopSignals,
+    *,
+    progress: bool,
+    pictures: Pictures | None,
+    live: LiveView | None,
 ) -> Journey:
     """Give every frame to the odometry, until they end or the user does not want any more."""
     sequence = opened.sequence
     began = time.perf_counter()
     problems: Counter[str] = Counter()
-    count = 0
+    count, has_depth = 0, False
     frames = iter(sequence)
     opening = list(itertools.islice(frames, 2))
     if truth is not None:
@@ -177,12 +212,19 @@ def _step_through(
         for frame in itertools.chain(opening, frames):
             estimate = odometry.step(frame)
             count += 1
+            has_depth = has_depth or frame.depth is not None
             problems.update([frame.problem] if frame.problem else [])
+            if pictures is not None:
+                pictures.add(frame)
+            if live is not None:
+                live.show(frame, estimate)
+                if count % MAP_EVERY == 0:
+                    live.show_map(odometry.finish())
             bar.set_postfix_str(estimate.state, refresh=False)
             bar.update()
             if stop.received:
                 break
-    return Journey(count, problems, time.perf_counter() - began)
+    return Journey(count, problems, time.perf_counter() - began, has_depth)
 
 
 def open_depth(config: DepthConfig) -> nn.Module | None:

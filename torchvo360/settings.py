@@ -38,6 +38,9 @@ DISTORTIONS = {"pinhole": "radtan", "fisheye": "equidistant"}
 
 AXES = ("x", "y", "z")
 
+VIEWERS = ("none", "rerun", "rerun_viewer")
+"""Of `viz`."""
+
 
 @dataclass(kw_only=True)
 class CameraConfig:
@@ -243,7 +246,13 @@ class RunConfig:
     overwrite: bool = False
     """Replace the run that `out` holds."""
     plot: str = "auto"
-    """Draw trajectory.png: auto draws it where matplotlib is installed."""
+    """Draw trajectory.png and errors.png: auto draws them where matplotlib is installed."""
+    report: bool = True
+    """Write report.html, a page that shows the whole run in a browser."""
+    report_mb: float = 12.0
+    """Greatest size of that page, megabytes: it holds as many pictures of the frames as there is room for."""
+    viz: str = "none"
+    """rerun records the run into run.rrd for the Rerun viewer, rerun_viewer opens that as well, none does neither."""
     progress: bool = True
     """Show a progress bar where standard error is a terminal."""
     synthetic: SyntheticConfig = field(default_factory=SyntheticConfig)
@@ -253,6 +262,8 @@ class RunConfig:
     def __post_init__(self) -> None:
         self.plot = str(self.plot).lower()  # true and false are no words to YAML
         check_choice("plot", self.plot, ("auto", "true", "false"))
+        check_choice("viz", self.viz, VIEWERS)
+        check_finite_number("report_mb", self.report_mb, above=0.0)
         check_choice("device", self.device, ("cpu", "cuda"))
         if not self.input:
             raise InputError("input: expected a video, a folder of images or a glob pattern, got an empty name.")

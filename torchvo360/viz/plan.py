@@ -54,14 +54,26 @@ def level_with_path(xyz: np.ndarray, rgb: np.ndarray, path_xyz: np.ndarray) -> P
     xyz, rgb = xyz[finite], rgb[finite]
     if not len(xyz):
         return None
-    path = torch.from_numpy(_thinned(path_xyz, MOST_POSITIONS))
-    parts = [torch.cdist(part, path).min(-1) for part in torch.from_numpy(xyz).split(CHUNK)]
-    distance, nearest = (torch.cat(column) for column in zip(*parts, strict=True))
-    level = np.abs(xyz[:, 2] - path[nearest, 2].numpy()) <= LEVEL_BAND * float(distance.median())
+    level = eye_level(xyz, path_xyz)
     if not level.any():
         return None
     order = _thinned(np.flatnonzero(level)[np.argsort(xyz[level, 2])], MOST_POINTS)
     return Plan(xyz[order, :2], rgb[order] / 255)
+
+
+def eye_level(xyz: np.ndarray, path_xyz: np.ndarray) -> np.ndarray:
+    """Return, [N], whether each point lies at about the height of the path near it.
+
+    Args:
+        xyz: Finite points, [N, 3], the last axis upwards.
+        path_xyz: Positions of the camera in the same axes and unit, at least one.
+    """
+    if not len(xyz):
+        return np.zeros(0, bool)
+    path = torch.from_numpy(_thinned(path_xyz, MOST_POSITIONS))
+    parts = [torch.cdist(part, path).min(-1) for part in torch.from_numpy(xyz).split(CHUNK)]
+    distance, nearest = (torch.cat(column) for column in zip(*parts, strict=True))
+    return np.abs(xyz[:, 2] - path[nearest, 2].numpy()) <= LEVEL_BAND * float(distance.median())
 
 
 def _thinned(rows: np.ndarray, most: int) -> np.ndarray:

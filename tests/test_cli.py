@@ -31,7 +31,7 @@ from torchvo360.runner import StopSignals
 from torchvo360.settings import RunConfig
 from torchvo360.vo import VisualOdometry
 
-WITHOUT_PICTURE = set(FILES) - {"trajectory.png"}
+WITHOUT_PICTURE = set(FILES) - {"trajectory.png", "errors.png", "run.rrd"}
 
 SMALL = SyntheticConfig(width=128, height=64, frames=8)
 SYNTHETIC = ["input=synthetic", "synthetic.width=128", "synthetic.height=64", "synthetic.frames=8", "plot=false"]
@@ -330,8 +330,10 @@ def test_the_odometry_is_given_the_imu(images, monkeypatch):
     settings = ["imu=imu.csv", "imu_sensor.T_cam_imu=[0.1,0,0,0,0,0,1]", "imu_sensor.gyro=0.002"]
     assert main(["input=images", *settings, "plot=false", "out=x"]) == 0
     assert (len(given["imu"].samples), given["imu"].noise.gyro) == (60, 0.002)
+    assert [note for note in summary_of(Path("x"))["notes"] if note.startswith("imu: it told rotations at most")]
     assert main(["input=images", "plot=false", "out=y"]) == 0
     assert given["imu"] is None
+    assert not [note for note in summary_of(Path("y"))["notes"] if note.startswith("imu")]
 
 
 # Bad input

@@ -57,6 +57,8 @@ def test_the_wheel_holds_the_configuration_and_runs_from_it(tmp_path):
     conf = {f"torchvo360/conf/{path.relative_to(conf_folder())}" for path in conf_folder().rglob("*") if path.is_file()}
     assert {*conf, "torchvo360/py.typed", "torchvo360/data/clips/theta_walk.mp4"} <= set(names)
     assert "torchvo360/data/clips/LICENSE" in names
+    page = {f"torchvo360/{path.relative_to(PACKAGE)}" for path in (PACKAGE / "viz" / "report" / "template").iterdir()}
+    assert page <= set(names)
 
     run = [sys.executable, "-m", "torchvo360", "--cfg"]
     environment = {**os.environ, "PYTHONPATH": str(tmp_path / "installed")}

@@ -24,7 +24,7 @@ import torch
 from torchvo360.cameras import Camera
 from torchvo360.checks import InputError
 from torchvo360.data import Trajectory
-from torchvo360.evaluation import Evaluation
+from torchvo360.evaluation import Evaluation, evaluate
 from torchvo360.export import write_ply, write_tum
 from torchvo360.files import atomic_path
 from torchvo360.settings import RunConfig
@@ -70,8 +70,6 @@ class Record:
     truth: Trajectory | None
     evaluation: Evaluation | None
     notes: list[str]
-    metric: bool = False
-    """Whether the estimate's unit is the metre."""
     pictures: Sequence[Picture] = ()
     """Of frames, for the report."""
 
@@ -188,7 +186,7 @@ def _write_report(path: Path, record: Record, summary: dict[str, Any]) -> None:
         result=record.result,
         summary=summary,
         truth=record.truth if record.evaluation else None,
-        metric=record.metric or record.result.gravity is not None,
+        metric=record.result.metric,
         pictures=record.pictures,
         defaults=asdict(RunConfig()),
     )
@@ -215,6 +213,7 @@ def summarise(record: Record) -> dict[str, Any]:
         "coverage": len(record.result.trajectory) / len(frames) if evaluation is None else evaluation.coverage,
         "keyframes": record.result.keyframes,
         "maps": record.result.maps,
+        "metric": record.result.metric,
         "loops": [[edge.i, edge.j] for edge in record.result.loops],
         "points": len(record.result.points.xyz),
         "seconds": record.seconds,
@@ -228,6 +227,9 @@ def summarise(record: Record) -> dict[str, Any]:
         figures["intrinsics"] = list(record.result.intrinsics)
     if evaluation is not None:
         figures |= {name: getattr(evaluation, name) for name in (*ERRORS, "path_length_m", "pairs")}
+        if record.result.metric and record.truth is not None:
+            in_metres = evaluate(record.result.trajectory, record.truth, align="se3")
+            figures["ate_se3_rmse_m"] = in_metres.ate_rmse_m
     figures |= {"notes": notes, "threads": torch.get_num_threads(), "versions": _versions()}
     return _finite(figures | {"settings": asdict(record.config)})
 
@@ -249,7 +251,7 @@ def describe(summary: dict[str, Any], folder: Path) -> list[str]:
     if "gravity" in summary:
         axes = ", ".join(f"{value:.3f}" for value in summary["gravity"])
         lines.append(f"gravity: {axes} m/s^2 in the world's axes; IMU times + {1e3 * summary['imu_offset_s']:.1f} ms")
-    if figures := [*(name for name in ERRORS if name in summary)]:
+    if figures := [*(name for name in (*ERRORS, "ate_se3_rmse_m") if name in summary)]:
         figures += ["coverage", "fps"]
         width = max(map(len, figures))
         lines += [f"{name:<{width}}  {_figure(summary[name])}" for name in figures]

@@ -143,7 +143,7 @@ def run(config: RunConfig, *, config_yaml: str = "") -> Outcome:
         if depth is not None and not any(estimate.reason == LEARNED for estimate in result.frames):
             notes.append("depth: the network was sure of too little of what it saw, so that the unit is not its metre.")
         if opened.imu is not None and result.gravity is None:
-            notes.append(f"imu: {NOT_COUPLED}")
+            notes.append(f"imu: {NOT_COUPLED}" + f" {result.imu_reason}" * bool(result.imu_reason))
         evaluation, complaint = None, ""
         if truth is not None:
             try:
@@ -161,7 +161,6 @@ def run(config: RunConfig, *, config_yaml: str = "") -> Outcome:
             truth=truth,
             evaluation=evaluation,
             notes=notes,
-            metric=depth is not None or sequence.rig is not None or journey.has_depth,
             pictures=pictures.kept,
         )
         lines = describe(write_all(folder, record), folder)
@@ -176,8 +175,6 @@ class Journey:
     problems: Counter[str]
     """Of the frames that could not be used."""
     seconds: float
-    has_depth: bool
-    """Whether a sensor's ranges came with the frames."""
 
     @property
     def usable(self) -> int:
@@ -199,7 +196,7 @@ def _step_through(
     sequence = opened.sequence
     began = time.perf_counter()
     problems: Counter[str] = Counter()
-    count, has_depth = 0, False
+    count = 0
     frames = iter(sequence)
     opening = list(itertools.islice(frames, 2))
     if truth is not None:
@@ -212,7 +209,6 @@ def _step_through(
         for frame in itertools.chain(opening, frames):
             estimate = odometry.step(frame)
             count += 1
-            has_depth = has_depth or frame.depth is not None
             problems.update([frame.problem] if frame.problem else [])
             if pictures is not None:
                 pictures.add(frame)
@@ -224,7 +220,7 @@ def _step_through(
             bar.update()
             if stop.received:
                 break
-    return Journey(count, problems, time.perf_counter() - began, has_depth)
+    return Journey(count, problems, time.perf_counter() - began)
 
 
 def open_depth(config: DepthConfig) -> nn.Module | None:

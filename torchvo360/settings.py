@@ -250,7 +250,7 @@ class RunConfig:
     report: bool = True
     """Write report.html, a page that shows the whole run in a browser."""
     report_mb: float = 12.0
-    """Greatest size of that page, megabytes: it holds as many pictures of the frames as there is room for."""
+    """Size up to which that page is filled with pictures of the frames, megabytes."""
     viz: str = "none"
     """rerun records the run into run.rrd for the Rerun viewer, rerun_viewer opens that as well, none does neither."""
     progress: bool = True

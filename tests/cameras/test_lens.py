@@ -177,3 +177,11 @@ def test_an_impossible_lens_is_refused(changed, message):
         Lens(**{**usual, "distortion": (0.1, 0, 0, 0), **changed})
     with pytest.raises(ShapeError):
         PLAIN.project(torch.zeros(2))
+
+
+@pytest.mark.parametrize("focal", [1e-9, -1.0])
+def test_a_calibration_of_an_impossible_angle_is_refused(focal):
+    with pytest.raises(
+        InputError, match=rf"^fy: expected at least 0\.02 of the image's height, got {focal:g} pixels\.$"
+    ):
+        Lens.of_opencv(320, 200, (160.0, focal, 160.0, 100.0))

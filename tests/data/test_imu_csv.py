@@ -66,6 +66,14 @@ def test_gaps_and_times_from_zero_are_read(tmp_path):
             "".join(line(0, t) for t in range(0, 25_000, 5000)),
             "expected times in nanoseconds, got a median step of 5000",
         ),
+        (
+            "".join(line(0, t) for t in range(0, 400_000_000, 100_000_000)),
+            "expected at least 20 samples a second, got 10",
+        ),
+        (line(0) + line(1).replace("9.2", "-1e200"), "line 2: expected numbers up to 100000, got -1e200"),
+        ("".join(map(line, range(50))), "expected angular rates in rad/s, got a median of 25"),
+        (line(0).replace("9.2,0.3,-3.15", "0,0,1") + line(1).replace("9.2,0.3,-3.15", "0,0,1"), "got a median of 1"),
+        (line(0).replace("9.2,0.3,-3.15", "0,0,0") + line(1).replace("9.2,0.3,-3.15", "0,0,0"), "got a median of 0"),
     ],
 )
 def test_a_bad_file_is_refused_in_one_sentence_with_the_line(tmp_path, text, message):

@@ -176,6 +176,11 @@ def test_what_cannot_be_made_is_refused(lens, options, message):
         undistort(lens, **options)
 
 
+def test_a_distortion_that_leaves_nothing_to_see_is_refused():
+    with pytest.raises(InputError, match=r"^camera: expected a lens that sees some of what"):
+        undistort(Lens(320, 200, 160.0, 160.0, 160.0, 100.0, "radtan", (1e30, 0.0, 0.0, 0.0)))
+
+
 def test_images_of_another_size_and_depth_for_a_panorama_are_refused():
     made = undistort(EUROC)
     with pytest.raises(InputError, match=r"^image: expected the lens's 376 x 240 pixels, got 240 x 376\.$"):

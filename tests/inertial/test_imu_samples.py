@@ -36,6 +36,8 @@ def test_other_values_are_named():
     gyro[1, 2] = math.nan
     with pytest.raises(InputError, match=r"imu\.gyro: expected finite numbers, got others in sample 1"):
         samples(0.0, 0.1, 0.2, gyro=gyro)
+    with pytest.raises(InputError, match=r"imu\.accel: expected numbers up to 100000, got larger ones in sample 2"):
+        samples(0.0, 0.1, 0.2, accel=torch.tensor([0.0, -9.81, -1e200], dtype=torch.float64)[:, None].expand(3, 3))
     with pytest.raises(InputError, match=r"imu\.accel: expected float64, got torch\.float32"):
         samples(0.0, 0.1, accel=torch.zeros(2, 3))
     with pytest.raises(InputError, match=r"imu\.accel: expected shape \[2 3\], got \[3, 3\]"):

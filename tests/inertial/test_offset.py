@@ -7,6 +7,7 @@ from imu_recordings import at, normal, read_flight
 from torchvo360.checks import InputError
 from torchvo360.data.synthetic import SyntheticConfig, SyntheticSequence
 from torchvo360.inertial import ImuSamples, ImuSensor, estimate_offset
+from torchvo360.inertial.offset import _Gyro
 from torchvo360.lie import se3, so3_exp
 
 
@@ -85,6 +86,22 @@ def test_a_camera_that_does_not_turn_does_not_tell():
     assert not found.ok
     assert found.reason == "The camera turns too little to tell the time offset."
     assert abs(found.offset_s) <= 0.4
+
+
+def test_an_hour_of_samples_beside_the_cameras_time_is_not_integrated(monkeypatch):
+    known = sequence(frames=121, seed=1, imu_offset_ms=40.0)
+    R, t_ns, samples = known.truth.T_world_cam[:, :3, :3], known.truth.t_ns, known.imu.samples
+    beside = torch.arange(1, 360_001) * 10_000_000
+    t_long = torch.cat([samples.t_ns[0] - beside.flip(0), samples.t_ns, samples.t_ns[-1] + beside])
+    rest = torch.ones(len(beside), 3, dtype=torch.float64)
+    long = ImuSamples(t_long, *(torch.cat([rest, part, rest]) for part in (samples.gyro, samples.accel)))
+    integrated = []
+    whole = _Gyro.of
+    monkeypatch.setattr(_Gyro, "of", lambda of, bias: integrated.append(len(of)) or whole(of, bias))
+    found = estimate_offset(R, t_ns, ImuSensor(long, T_cam_imu=known.imu.T_cam_imu))
+    assert found.ok, found.reason
+    assert found.offset_s == pytest.approx(estimate_offset(R, t_ns, known.imu).offset_s, abs=1e-6)
+    assert max(integrated) < 1.2 * len(samples)
 
 
 def test_no_overlap_is_told():

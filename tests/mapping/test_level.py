@@ -28,7 +28,7 @@ def seen_world(world="pillars", frames=120, every=15):
 def test_the_floor_of_a_world_is_found_within_two_centimetres_and_half_a_degree(world):
     rays, T_world_cam = seen_world(world)
     path = T_world_cam[:, :3, 3]
-    rough = so3_exp(torch.tensor([0.06, -0.05, 0.0], dtype=torch.float64)) @ UP
+    rough = so3_exp(torch.tensor([0.1, -0.07, 0.0], dtype=torch.float64)) @ UP
     floor = find_floor(rays, path, rough)
     assert floor is not None
     assert floor.clear
@@ -55,6 +55,28 @@ def test_turned_scaled_and_moved_everything_is_found_as_before():
     assert after.clear == before.clear
     assert after.camera_height == pytest.approx(0.31 * before.camera_height, rel=0.01)
     assert float(after.up @ (R @ before.up)) > math.cos(math.radians(0.3))
+
+
+def test_a_strip_of_floor_does_not_tell_how_it_leans():
+    generator = torch.Generator().manual_seed(0)
+    path = torch.stack([torch.linspace(0, 8, 50), torch.zeros(50), torch.full((50,), 1.5)], -1).double()
+    points = torch.randn(400, 3, generator=generator, dtype=torch.float64) * torch.tensor([0.0, 0.03, 0.03])
+    points[:, 0] = 8 * torch.rand(400, generator=generator, dtype=torch.float64)
+    floor = find_floor(Rays.of(path[:1].expand_as(points), points), path, UP)
+    assert floor is not None
+    assert floor.clear
+    assert math.degrees(math.acos(min(1.0, float(floor.up @ UP)))) < 0.5
+    assert floor.camera_height == pytest.approx(1.5, abs=0.01)
+
+
+def test_few_points_do_not_tell_the_upward_direction():
+    generator = torch.Generator().manual_seed(0)
+    path = torch.stack([torch.linspace(0, 8, 50), torch.zeros(50), torch.full((50,), 1.5)], -1).double()
+    points = torch.rand(60, 3, generator=generator, dtype=torch.float64) * torch.tensor([8.0, 2.0, 0.2])
+    floor = find_floor(Rays.of(path[:1].expand_as(points), points), path, UP)
+    assert floor is not None
+    assert floor.clear
+    torch.testing.assert_close(floor.up, UP)
 
 
 def test_known_gravity_is_not_tilted():

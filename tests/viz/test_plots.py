@@ -34,11 +34,12 @@ def circle(frames: int = 60, *, tall: float = 1.0) -> Trajectory:
 def patch(centre: tuple[float, float, float], colour: str, *, size: float = 0.5, count: int = 2000) -> PointCloud:
     """Points of one colour in a cube about a place."""
     xyz = torch.tensor(centre) + size * (torch.rand(count, 3, generator=torch.Generator().manual_seed(0)) - 0.5)
-    return PointCloud(xyz, torch.tensor(list(bytes.fromhex(colour[1:])), dtype=torch.uint8).expand(count, 3), torch.zeros(count).int())
+    rgb = torch.tensor(list(bytes.fromhex(colour[1:])), dtype=torch.uint8).expand(count, 3)
+    return PointCloud(xyz, rgb, torch.zeros(count).int())
 
 
 def joined(*clouds: PointCloud) -> PointCloud:
-    return PointCloud(torch.cat([cloud.xyz for cloud in clouds]), torch.cat([cloud.rgb for cloud in clouds]), torch.cat([cloud.frame for cloud in clouds]))
+    return PointCloud(*(torch.cat([getattr(cloud, name) for cloud in clouds]) for name in ("xyz", "rgb", "frame")))
 
 
 def read(path) -> np.ndarray:
@@ -150,7 +151,8 @@ def test_without_points_the_picture_is_that_of_the_path_alone(tmp_path):
 
 
 def test_points_that_are_not_finite_are_left_out(tmp_path, walls):
-    bad = PointCloud(torch.tensor([[math.nan] * 3, [math.inf, 0, 0]]), torch.zeros(2, 3, dtype=torch.uint8))
+    nowhere = torch.tensor([[math.nan] * 3, [math.inf, 0, 0]])
+    bad = PointCloud(nowhere, torch.zeros(2, 3, dtype=torch.uint8), torch.zeros(2).int())
     for name, points in (("walls.png", walls), ("bad.png", joined(bad, walls))):
         plot_trajectory(tmp_path / name, circle(), points=points)
     assert (tmp_path / "bad.png").read_bytes() == (tmp_path / "walls.png").read_bytes()
@@ -187,8 +189,9 @@ def test_bad_arguments_are_refused_and_nothing_is_written(tmp_path):
         plot_trajectory(tmp_path / "a.png", circle(), states=["tracking", "lost"])
     with pytest.raises(InputError, match=r"^truth: expected at least 3 poses"):
         plot_trajectory(tmp_path / "a.png", circle(), truth=circle(2))
+    uneven = PointCloud(torch.zeros(2, 3), torch.zeros(3, 3).byte(), torch.zeros(2).int())
     with pytest.raises(ShapeError, match=r"^points.rgb"):
-        plot_trajectory(tmp_path / "a.png", circle(), points=PointCloud(torch.zeros(2, 3), torch.zeros(3, 3).byte()))
+        plot_trajectory(tmp_path / "a.png", circle(), points=uneven)
     assert not list(tmp_path.iterdir())
 
 

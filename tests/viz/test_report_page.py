@@ -3,6 +3,7 @@
 import base64
 import itertools
 import json
+import math
 import os
 import select
 import shutil
@@ -19,7 +20,7 @@ import pytest
 import torch
 from test_report import NASTY, sample
 
-from torchvo360.cameras import Pinhole
+from torchvo360.cameras import Equirectangular, Pinhole
 from torchvo360.viz.report import Content, write_report
 from torchvo360.vo.loops import LoopEdge
 
@@ -169,6 +170,16 @@ class Browser:
     def wheel(self, selector: str, delta: float) -> None:
         box = self.box(selector)
         self.mouse("mouseWheel", box["x"] + box["width"] / 2, box["y"] + box["height"] / 2, deltaX=0, deltaY=delta)
+        self.settle()
+
+    def pinch(self, selector: str, factor: float) -> None:
+        """Draw two fingers apart by a factor."""
+        box = self.box(selector)
+        x, y = box["x"] + box["width"] / 2, box["y"] + box["height"] / 2
+        for kind, half in (("Start", 30), ("Move", 30 * (1 + factor) / 2), ("Move", 30 * factor)):
+            fingers = [{"x": x - half, "y": y}, {"x": x + half, "y": y}]
+            self("Input.dispatchTouchEvent", type=f"touch{kind}", touchPoints=fingers)
+        self("Input.dispatchTouchEvent", type="touchEnd", touchPoints=[])
         self.settle()
 
     def key(self, key: str, *, shift: bool = False) -> None:
@@ -333,19 +344,46 @@ def middle(image: np.ndarray) -> np.ndarray:
     return image[height // 2 - 4 : height // 2 + 4, width // 2 - 4 : width // 2 + 4].reshape(-1, 3).mean(0)
 
 
+def turn_right(page: Browser, degrees: int) -> None:
+    """Turn the panorama by keys, five degrees or so each, as far as it takes."""
+    page.js("document.querySelector('#panorama').focus({preventScroll: true})")
+    for _ in range(60):
+        if page.js("parseInt(document.getElementById('look').textContent.slice(6))") >= degrees:
+            return
+        page.key("ArrowRight", shift=True)
+    raise AssertionError(degrees)
+
+
+def test_a_panorama_of_half_the_sphere_shows_that_half_and_the_ground_beyond_it(browser, tmp_path):
+    half = Equirectangular(64, 32, 64 / math.pi, -32 / math.pi, 32.0, 16.0)
+    write_report(tmp_path / "report.html", sample(camera=half))
+    browser.open(tmp_path / "report.html")
+    browser.wait("document.getElementById('panorama').dataset.frame === '10'")
+    browser.settle()
+    np.testing.assert_allclose(middle(browser.picture("#panorama")), [20, 20, 230], atol=25)
+    turn_right(browser, 43)
+    np.testing.assert_allclose(middle(browser.picture("#panorama")), [20, 200, 20], atol=25)
+    turn_right(browser, 130)
+    np.testing.assert_allclose(middle(browser.picture("#panorama")), [0xF4, 0xF1, 0xED], atol=2)
+    assert browser.complaints == []
+
+
 def test_the_panorama_looks_ahead_and_a_quarter_turn_shows_what_is_to_the_right(page):
     red, green = [20, 20, 230], [20, 200, 20]
     np.testing.assert_allclose(middle(page.picture("#panorama")), red, atol=25)
     page.js("document.getElementById('steady').click()")
-    for _ in range(12):  # by keys of 30 pixels each: as far as it takes to 90 degrees
-        if page.js("parseInt(document.getElementById('look').textContent.slice(6)) >= 86"):
-            break
-        page.js("document.querySelector('#panorama').focus({preventScroll: true})")
-        page.key("ArrowRight", shift=True)
-        page.key("ArrowRight", shift=True)
+    turn_right(page, 88)
     np.testing.assert_allclose(middle(page.picture("#panorama")), green, atol=25)
     page.click("#picture-reset")
     np.testing.assert_allclose(middle(page.picture("#panorama")), red, atol=25)
+
+
+def test_looking_up_shows_what_is_above_and_goes_no_farther(page):
+    page.js("document.querySelector('#panorama').focus({preventScroll: true})")
+    for _ in range(24):
+        page.key("ArrowUp", shift=True)
+    assert "up 90°" in page.js("document.getElementById('look').textContent")
+    np.testing.assert_allclose(middle(page.picture("#panorama")), [220, 30, 30], atol=25)
 
 
 def test_a_steady_view_keeps_its_direction_while_the_camera_turns(page):
@@ -393,6 +431,18 @@ def test_the_theme_follows_the_system_until_the_button_is_used(browser, walked):
     assert browser.complaints == []
 
 
+def test_two_fingers_zoom(browser, walked):
+    browser.open(walked, width=400, touch=True)
+    read = "parseInt(document.getElementById('look').textContent.split('view ')[1])"
+    before, wide = browser.picture("#scene"), browser.js(read)
+    browser.pinch("#scene", 2.0)
+    assert different(before, browser.picture("#scene")) > 3e-3
+    browser.pinch("#panorama", 2.0)
+    assert browser.js(read) == pytest.approx(wide / 2, abs=2)
+    assert where(browser).startswith("Frame 10 ")
+    assert browser.complaints == []
+
+
 @pytest.mark.parametrize("width", [400, 1280])
 def test_nothing_sticks_out_to_the_side_and_every_control_has_a_name(browser, walked, width):
     browser.open(walked, width=width, touch=width < 500)
@@ -429,7 +479,7 @@ def test_pages_of_little_content_open_without_complaint(browser, tmp_path, conte
     assert where(browser).startswith(f"Frame {9 + len(content.result.frames)} ")
     browser.drag("#scene", 60, 30)
     assert browser.js("document.getElementById('no-picture').hidden") == bool(content.pictures)
-    pinhole = not content.camera.wraps
+    pinhole = isinstance(content.camera, Pinhole)
     assert browser.js("document.getElementById('panorama').hidden") == (pinhole or not content.pictures)
     told = browser.js("document.getElementById('legend').textContent")
     assert ("before loops" in told) == bool(content.result.loops)

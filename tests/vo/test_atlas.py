@@ -269,6 +269,29 @@ def test_the_points_of_a_joined_map_have_the_first_one_s_unit():
     torch.testing.assert_close(cloud.xyz, p_world.float().expand(20, 3), rtol=0, atol=1e-5)
 
 
+def test_a_map_that_learns_its_metre_grows_about_its_first_keyframe():
+    atlas = Atlas()
+    start = motion(1.0, 2.0, 3.0, 0.0, 0.5, 0.0)
+    atlas.begin(Keys({0: start, 1: start @ lie.se3(EYE[:3, :3], torch.tensor([0.0, 0.0, 1.0]).double())}))
+    for scale in (2.0, 3.0):
+        atlas.rescale(scale)
+        after = atlas.keyframes()
+        assert atlas.scale_of(0) == pytest.approx(scale)
+        torch.testing.assert_close(after[0][:3, 3], start[:3, 3])
+        assert float((after[1][:3, 3] - start[:3, 3]).norm()) == pytest.approx(scale)
+
+
+def test_maps_that_are_joined_learn_the_metre_together():
+    atlas, true = two_maps()
+    atlas.join(between_maps(atlas, 3, 15, true))
+    before = atlas.keyframes()
+    atlas.rescale(2.0 * atlas.scale_of(1))
+    after = atlas.keyframes()
+    for k in range(20):
+        torch.testing.assert_close(after[k][:3, 3], 2.0 * (before[k][:3, 3] - before[0][:3, 3]) + before[0][:3, 3])
+    assert atlas.scale_of(0) == pytest.approx(2.0)
+
+
 # Loops
 
 

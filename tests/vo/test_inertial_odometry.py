@@ -13,6 +13,7 @@ from torchvo360.data.synthetic import SyntheticConfig, SyntheticSequence
 from torchvo360.evaluation import evaluate
 from torchvo360.inertial import ImuSamples, ImuSensor
 from torchvo360.vo import FrameEstimate, OdometryConfig, OdometryResult, State, VisualOdometry
+from torchvo360.vo.inertial import InertialLink
 
 WALK = {"width": 256, "height": 128, "frames": 200, "imu_rate": 200.0}
 PINHOLE = {"camera": "pinhole", "width": 320, "height": 240}
@@ -23,10 +24,10 @@ DOWN = torch.tensor([0.0, 0.0, -1.0], dtype=torch.float64)
 class Journey:
     """A synthetic walk with an IMU, gone through."""
 
-    def __init__(self, sensor: ImuSensor | None = None, **settings: object) -> None:
+    def __init__(self, sensor: ImuSensor | None = None, *, config: OdometryConfig = CONFIG, **settings: object) -> None:
         self.sequence = SyntheticSequence(SyntheticConfig(**{**WALK, **settings}))  # type: ignore[arg-type]
         sensor = self.sequence.imu if sensor is None else sensor
-        odometry = VisualOdometry(self.sequence.camera, CONFIG, imu=sensor)
+        odometry = VisualOdometry(self.sequence.camera, config, imu=sensor, rig=self.sequence.rig)
         self.online: list[FrameEstimate] = [odometry.step(frame) for frame in self.sequence]
         self.result: OdometryResult = odometry.finish()
 
@@ -75,6 +76,38 @@ def test_two_seconds_without_images_are_bridged_to_a_few_centimetres():
     gone = journey.online[black[-1]].T_world_cam[:3, 3] - journey.online[black[0]].T_world_cam[:3, 3]
     true = journey.sequence.pose(black[-1])[:3, 3] - journey.sequence.pose(black[0])[:3, 3]
     assert abs(float(gone.norm() - true.norm())) < 0.1
+
+
+def test_smoothing_leaves_the_bridge_that_the_imu_built():
+    plain, smooth = (
+        Journey(world="pillars", seed=1, blackout_s=1.2, frames=170, config=replace(CONFIG, smooth=smooth))
+        for smooth in (False, True)
+    )
+    black = [at for at, estimate in enumerate(plain.online) if estimate.reason == "bad_frame_black"]
+    assert float(smooth.errors_m()[black].max()) < float(plain.errors_m()[black].max()) + 0.01
+
+
+def test_a_rig_keeps_its_metre_beside_an_imu():
+    both = Journey(world="room", seed=0, frames=120, stereo_baseline=0.2, stereo_axis="y")
+    assert both.result.gravity is not None
+    assert both.result.metric
+    assert both.gravity_error_deg < 0.5
+    assert both.scale_error < 0.005
+
+
+def test_a_camera_that_stands_does_not_grow_slow_beside_its_imu():
+    """What was measured since the newest keyframe is kept, and every frame adds its own part."""
+    journey = Journey(world="room", seed=0, frames=100)
+    imu = journey.sequence.imu
+    assert imu is not None
+    link = InertialLink(imu, CONFIG.inertial, 4 / 255)
+    bias = torch.zeros(6, dtype=torch.float64)
+    times = journey.sequence.truth.t_ns.tolist()
+    for at in range(11, 100):
+        kept = link._since_key(times[10], times[at], bias)
+    whole = link.between([times[10], times[99]], bias)
+    torch.testing.assert_close(kept.dR, whole.dR, rtol=0, atol=1e-5)
+    torch.testing.assert_close(kept.dp, whole.dp, rtol=0, atol=1e-4)
 
 
 def test_a_second_without_samples_is_survived():

@@ -34,6 +34,9 @@ CONVERGED_PX = 1e-6
 MAX_SLOPE = 1e4
 """Farthest point of the plane z = 1 that is looked at where the polynomial never folds."""
 
+LEAST_FOCAL = 0.02
+"""Of a calibration, in widths or heights of the image: a plane would be seen 175 degrees across."""
+
 
 @dataclass(frozen=True)
 class Lens:
@@ -94,7 +97,13 @@ class Lens:
             InputError: A number is impossible, or there are too many or too few.
         """
         fx, fy, cx, cy = intrinsics
-        return cls(width, height, fx, fy, cx + 0.5, cy + 0.5, model, tuple(distortion))
+        lens = cls(width, height, fx, fy, cx + 0.5, cy + 0.5, model, tuple(distortion))
+        for name, focal, side, length in (("fx", fx, "width", width), ("fy", fy, "height", height)):
+            if abs(focal) < LEAST_FOCAL * length:
+                raise InputError(
+                    f"{name}: expected at least {LEAST_FOCAL:g} of the image's {side}, got {focal:g} pixels."
+                )
+        return lens
 
     @property
     def pinhole(self) -> Pinhole:

@@ -129,7 +129,7 @@ def _write(
     if settings.run is not None:
         write_map(folder, ground.occupancy, unit=ground.unit)
     if plan.found:
-        lines = ["x,y", *(f"{x:.6g},{y:.6g}" for x, y in plan.xy.tolist())]
+        lines = ["x,y", *(f"{round(x, 6):.9g},{round(y, 6):.9g}" for x, y in plan.xy.tolist())]
         write_atomically(folder / "path.csv", "\n".join(lines) + "\n")
     else:
         (folder / "path.csv").unlink(missing_ok=True)  # an earlier plan's
@@ -166,7 +166,7 @@ def _described(ground: Ground, plan: Plan, ends: Sequence[tuple[float, float]]) 
     ]
     if not plan.found:
         return [*lines, plan.message]
-    (x, y), (u, v) = ends
+    x, y, u, v = (round(value, 6) + 0.0 for end in ends for value in end)  # neither 1e-28 nor -0
     return [
         *lines,
         f"way: {plan.length:.3g} {unit} from ({x:.4g}, {y:.4g}) to ({u:.4g}, {v:.4g}), {len(plan.xy)} corners, "

@@ -80,13 +80,9 @@ def read_surroundings(folder: str | Path, source: str, stride: int | None, metri
 
 
 def _is_metric(folder: str | Path) -> bool:
-    """Return what the run's summary says; of older ones without a word on it, what its settings tell."""
+    """Return whether a run's unit is the metre, as its summary says."""
     summary: dict[str, Any] = json.loads((Path(folder).expanduser() / "summary.json").read_text(encoding="utf-8"))
-    if "metric" in summary:
-        return bool(summary["metric"])
-    config = read_settings(folder)
-    pair = config.rig.layout != "none" or config.synthetic.stereo_baseline > 0
-    return "gravity" in summary or pair or config.synthetic.depth_noise is not None
+    return bool(summary.get("metric"))
 
 
 def _dense(folder: str | Path, known: Recorded, source: str, stride: int | None) -> Rays:

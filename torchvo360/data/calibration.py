@@ -30,6 +30,7 @@ from torch import Tensor
 
 from torchvo360.cameras import Lens
 from torchvo360.checks import InputError, is_pose
+from torchvo360.data.table import read_text
 from torchvo360.lie import matrix_from_quaternion, se3, se3_inverse
 
 MODELS = {
@@ -110,6 +111,24 @@ def _sensor(settings: "_Node") -> Calibration:
     return Calibration(str(settings.place), (lens,), T_body_cam[None], se3_inverse(T_body_cam))
 
 
+def read_yaml(file: Path) -> Mapping[str, Any]:
+    """Return the keys and values of a calibration in YAML.
+
+    Raises:
+        InputError: The file is missing or holds something else.
+    """
+    text = read_text(file, "a calibration file")
+    # OpenCV's first line, %YAML:1.0, is no YAML
+    lines = [line for line in text.splitlines() if not line.startswith("%YAML")]
+    try:
+        values = yaml.safe_load("\n".join(lines))
+    except (yaml.YAMLError, ValueError, RecursionError):  # no such grammar, an impossible date, too deep
+        raise InputError(f"{file}: expected a calibration in YAML, got another text.") from None
+    if not isinstance(values, Mapping):
+        raise InputError(f"{file}: expected a calibration in YAML with the keys of a sensor, got none.")
+    return values
+
+
 def pose_of_numbers(name: str, values: Any) -> Float64[Tensor, "4 4"]:
     """Return the rigid motion that numbers stand for.
 
@@ -157,21 +176,7 @@ class _Node:
 
     @classmethod
     def read(cls, file: Path) -> "_Node":
-        try:
-            text = file.read_text(encoding="utf-8-sig")
-        except OSError as error:
-            raise InputError(f"{file}: expected a calibration file, got {error.strerror or error}.") from None
-        except UnicodeDecodeError:
-            raise InputError(f"{file}: expected a calibration file, got a binary file.") from None
-        # OpenCV's first line, %YAML:1.0, is no YAML
-        lines = [line for line in text.splitlines() if not line.startswith("%YAML")]
-        try:
-            values = yaml.safe_load("\n".join(lines))
-        except (yaml.YAMLError, RecursionError):
-            raise InputError(f"{file}: expected a calibration in YAML, got another text.") from None
-        if not isinstance(values, Mapping):
-            raise InputError(f"{file}: expected a calibration in YAML with the keys of a camera, got none.")
-        return cls(str(file), values)
+        return cls(str(file), read_yaml(file))
 
     def child(self, name: str) -> "_Node":
         values = self.values[name]

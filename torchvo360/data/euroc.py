@@ -14,22 +14,20 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
-import yaml
 from jaxtyping import Float64, Int64
 from torch import Tensor
 
 from torchvo360.cameras import Lens
 from torchvo360.cameras.rig import MIN_BASELINE
 from torchvo360.checks import InputError
-from torchvo360.data.calibration import pose_of_numbers, read_calibration
+from torchvo360.data.calibration import LEAST_QUATERNION, pose_of_numbers, read_calibration, read_yaml
 from torchvo360.data.imu import read_imu_csv
 from torchvo360.data.recording import Recording, Stream, rig_poses
 from torchvo360.data.selection import Selection
-from torchvo360.data.table import Table, read_text
+from torchvo360.data.table import Table
 from torchvo360.data.trajectory import Trajectory
 from torchvo360.inertial import ImuNoise, ImuSensor
 from torchvo360.lie import matrix_from_quaternion, se3, se3_inverse
@@ -40,8 +38,6 @@ NOISE = {
     "gyro_walk": "gyroscope_random_walk",
     "accel_walk": "accelerometer_random_walk",
 }
-
-LEAST_QUATERNION = 1e-6
 
 
 def open_euroc(
@@ -134,7 +130,7 @@ def _read_imu(folder: Path, T_body_cam: Float64[Tensor, "4 4"], notes: list[str]
             "imu: there is no sensor.yaml for imu0: it is taken for the body, with the noise of EuRoC's sensor."
         )
         return ImuSensor(samples, T_cam_imu=se3_inverse(T_body_cam))
-    settings = _read_settings(file)
+    settings = read_yaml(file)
     missing = [key for key in ("T_BS", *NOISE.values()) if key not in settings]
     if missing:
         raise InputError(f"{file}: expected {missing[0]}, got none.")
@@ -147,19 +143,6 @@ def _read_imu(folder: Path, T_body_cam: Float64[Tensor, "4 4"], notes: list[str]
         keys = ", ".join(NOISE.values())
         raise InputError(f"{file}: expected finite numbers above 0 in {keys}, got others.") from None
     return ImuSensor(samples, noise, se3_inverse(T_body_cam) @ T_body_imu)
-
-
-def _read_settings(file: Path) -> Mapping[str, Any]:
-    text = read_text(file, "a calibration in YAML")
-    # OpenCV's first line, %YAML:1.0, is no YAML
-    lines = [line for line in text.splitlines() if not line.startswith("%YAML")]
-    try:
-        settings = yaml.safe_load("\n".join(lines))
-    except (yaml.YAMLError, ValueError, RecursionError):  # no such grammar, an impossible date, too deep
-        settings = None
-    if not isinstance(settings, Mapping):
-        raise InputError(f"{file}: expected a calibration in YAML, got another text.")
-    return settings
 
 
 def _read_truth(file: Path, T_body_cam: Float64[Tensor, "4 4"]) -> Trajectory | None:

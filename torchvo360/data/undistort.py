@@ -127,6 +127,8 @@ def undistort(lens: Lens, *, target: str = "auto", size: tuple[int, int] | None 
     rays = camera.ray_grid(dtype=torch.float64)
     some = [lens.project(rows) for rows in rays.split(ROWS_AT_ONCE)]
     uv, seen = (torch.cat(parts) for parts in zip(*some, strict=True))
+    if not bool(seen.any()):
+        raise InputError("camera: expected a lens that sees some of what its image is resampled to, got none of it.")
     shrunk = _shrunk(lens, camera)
     by = torch.tensor([shrunk.width / lens.width, shrunk.height / lens.height], dtype=torch.float64)
     return Undistortion(

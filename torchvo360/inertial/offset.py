@@ -6,7 +6,7 @@ under Huber's weights. Over such a time the turn differs from that of a shifted 
 many times more than over the time of a frame, and the rotations' errors are the same.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import torch
@@ -76,6 +76,7 @@ def estimate_offset(
         raise InputError("t_ns: expected increasing times in integer nanoseconds, got others.")
     check_finite_number("search_s", search_s, above=0, at_most=10)
     check_finite_number("max_deviation_s", max_deviation_s, above=0)
+    sensor = _during(sensor, t_ns, search_s + STEPS * GRID_S)
     turns = _turns(R_world_cam.double(), t_ns, sensor)
     shifts = torch.arange(-round(search_s / GRID_S), round(search_s / GRID_S) + 1).double() * GRID_S
     gyro = _Gyro.of(sensor.samples, torch.zeros(3, dtype=torch.float64))
@@ -101,6 +102,19 @@ class _Turns(NamedTuple):
     start: Float64[Tensor, "K"]
     end: Float64[Tensor, "K"]
     R: Float64[Tensor, "K 3 3"]
+
+
+def _during(sensor: ImuSensor, t_ns: Int64[Tensor, "N"], margin_s: float) -> ImuSensor:
+    """Return the IMU with the samples about the camera's times alone: those of an hour take a minute to integrate."""
+    samples = sensor.samples
+    if not len(t_ns):
+        return sensor
+    ends = t_ns[[0, -1]] - round(sensor.offset_s * 1e9) + round(margin_s * 1e9) * t_ns.new_tensor([-1, 1])
+    first, last = torch.searchsorted(samples.t_ns, ends).tolist()
+    # One more at each end, between which the first and the last are interpolated; two at least.
+    first = min(max(first - 1, 0), len(samples) - 2)
+    kept = slice(first, max(last + 1, first + 2))
+    return replace(sensor, samples=ImuSamples(samples.t_ns[kept], samples.gyro[kept], samples.accel[kept]))
 
 
 def _turns(R_world_cam: Float64[Tensor, "N 3 3"], t_ns: Int64[Tensor, "N"], sensor: ImuSensor) -> _Turns:

@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import dataclass, field
+from functools import cached_property
 
 import torch
 from jaxtyping import Float64, Int64
@@ -12,6 +13,9 @@ from torchvo360.residuals.inertial import ImuNoise
 
 GRAVITY = 9.81
 """Length of gravity, m/s^2; it differs by 0.3 % between the equator and the poles."""
+
+LARGEST = 1e5
+"""Rates and forces, rad/s and m/s^2, that no sensor exceeds: ten thousand times gravity. Beyond it numbers overflow."""
 
 
 def _identity() -> Float64[Tensor, "4 4"]:
@@ -41,6 +45,9 @@ class ImuSamples:
             if not bool(torch.isfinite(value).all()):
                 row = int((~torch.isfinite(value).all(1)).nonzero()[0])
                 raise InputError(f"imu.{name}: expected finite numbers, got others in sample {row}.")
+            if bool((value.abs() > LARGEST).any()):
+                row = int((value.abs() > LARGEST).any(1).nonzero()[0])
+                raise InputError(f"imu.{name}: expected numbers up to {LARGEST:g}, got larger ones in sample {row}.")
         if self.t_ns.dtype != torch.int64:
             raise InputError(f"imu.t_ns: expected int64, got {self.t_ns.dtype}.")
         if len(self.t_ns) < 2:
@@ -54,7 +61,7 @@ class ImuSamples:
     def __len__(self) -> int:
         return self.t_ns.shape[0]
 
-    @property
+    @cached_property
     def period_ns(self) -> int:
         """The median time between samples."""
         return int(self.t_ns.diff().median())

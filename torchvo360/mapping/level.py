@@ -2,7 +2,7 @@
 
 The floor is the depth at which the most points lie of those that the camera passed over. Walls and furniture beside
 the path are no part of that: a point counts if it lies within a cone below some place of the path. Where no gravity is
-known the axes are tilted until the share of the floor among these points is largest.
+known the plane through the floor's points tells what is upright.
 """
 
 import math
@@ -13,15 +13,15 @@ from jaxtyping import Float64
 from torch import Tensor
 
 from torchvo360.checks import InputError, check_pose, check_shape
-from torchvo360.lie import se3, so3_exp
+from torchvo360.lie import se3
 from torchvo360.mapping.rays import Rays
 
 CONES = (1.5, 3.0)
 """Horizontal over vertical distance from the path within which points lie below it; the second where the first holds
 too few. Source: in a real corridor 32 of 37 points in the first lie on the floor, in the second 70 of 396."""
 
-MOST_TILT_DEG, TILT_STEP_DEG = 8.0, 1.0
-"""How far from upright a hand holds a camera on average, and how finely that is searched."""
+MOST_TILT_DEG = 12.0
+"""How far from upright a hand holds a camera on average."""
 
 MOST_POINTS, MOST_PLACES = 20_000, 300
 """More points, or places on the path, change the floor little."""
@@ -36,7 +36,11 @@ CLEAR_SHARE, CLEAR_POINTS = 0.35, 25
 """Share and number of the points in the first cone by which a floor stands out. Source: 0.86 of 1,100 in a rendered
 hall, 0.8 of 37 in a corridor whose floor is masked near the camera."""
 
-REFINEMENTS = 3
+TILT_POINTS = 200
+"""Fewer points in the first cone do not tell the upward direction: 37 of a corridor turned it by 3 degrees."""
+
+NEAR_SHARES = (0.2, 0.15, 0.1, 0.05)
+"""Of the cameras' height: how near points have to be to the floor, as it gets better known."""
 
 
 @dataclass(frozen=True)
@@ -111,7 +115,7 @@ def find_floor(
         rays: What was seen, in the world.
         path: Camera centres.
         up: Upwards in the world, as far as it is known.
-        tilt: Let the floor tell the upward direction better, within 8 degrees, where it stands out.
+        tilt: Let the floor tell the upward direction better, within 12 degrees, where many points of it stand out.
 
     Returns:
         The floor; None where nothing was seen below the path.
@@ -129,18 +133,14 @@ def find_floor(
         point, offset = _below(points, places, up, CONES[1])
     if not len(point):
         return None
-    normals = _tilted(up) if tilt and enough else up[None]
-    count, depth = _most_common_depth(-(offset @ normals.mT).mT)
-    # the upright one wins over others that are hardly better
-    best = int((count * (1 - 0.02 * torch.linalg.vector_norm(normals - up, dim=-1) / math.radians(1))).argmax())
-    clear = enough and bool(count[best] >= CLEAR_SHARE * len(point))
-    if not clear:
-        best = int((normals @ up).argmax())
-    normal, level = normals[best], depth[best]
-    near = point[((offset @ normal + level).abs() <= 0.1 * level)]
-    height = float((near @ normal).median() if len(near) else (path @ normal).median() - level)
+    depth = -(offset @ up)
+    count, level = _most_common(depth)
+    clear = enough and count >= CLEAR_SHARE * len(point)
+    near = (depth - level).abs() <= 0.1 * level
+    height = float((point[near] @ up).median() if bool(near.any()) else (path @ up).median() - level)
+    normal = up
     if clear:
-        normal, height = _refined(point, normal, height, float(level), tilt=tilt)
+        normal, height = _refined(point, up, height, level, tilt=tilt and len(point) >= TILT_POINTS)
     camera_height = float((path @ normal).median()) - height
     return Floor(normal, camera_height, height, clear) if camera_height > 0 else None
 
@@ -156,26 +156,15 @@ def _below(
     return points[below], offset[below]
 
 
-def _tilted(up: Float64[Tensor, "3"]) -> Float64[Tensor, "T 3"]:
-    """Return directions about upwards, a grid of turns about two level axes."""
-    steps = torch.deg2rad(torch.arange(-MOST_TILT_DEG, MOST_TILT_DEG + TILT_STEP_DEG, TILT_STEP_DEG).double())
-    a, b = torch.meshgrid(steps, steps, indexing="ij")
-    level = torch.linalg.svd(up[None])[2][1:]  # two directions square to upwards
-    return so3_exp(a.reshape(-1, 1) * level[0] + b.reshape(-1, 1) * level[1]) @ up
-
-
-def _most_common_depth(depth: Float64[Tensor, "T N"]) -> tuple[Float64[Tensor, "T"], Float64[Tensor, "T"]]:
-    """Return, by row, how many points the fullest window of depths holds, and its middle."""
-    greatest = depth[depth > 0].quantile(0.98) * 1.2 if bool((depth > 0).any()) else depth.new_ones(())
+def _most_common(depth: Float64[Tensor, "N"]) -> tuple[int, float]:
+    """Return how many points the fullest window of depths holds, and its middle; depths are above 0."""
+    greatest = depth.quantile(0.98) * 1.2
     low = (greatest * LEAST_DEPTH_SHARE).log()
     step = (greatest.log() - low) / BINS
-    bin = ((depth.clamp_min(1e-12).log() - low) / step).floor().long()
-    inside = (bin >= 0) & (bin < BINS) & (depth > 0)
-    row = torch.arange(len(depth))[:, None].expand_as(bin)
-    counts = torch.bincount((row * BINS + bin)[inside], minlength=len(depth) * BINS).view(len(depth), BINS)
-    held = counts.double().unfold(1, WINDOW, 1).sum(-1)
-    count, at = held.max(1)
-    return count, ((at + WINDOW / 2) * step + low).exp()
+    bin = ((depth.log() - low) / step).floor().long()
+    counts = torch.bincount(bin[(bin >= 0) & (bin < BINS)], minlength=BINS)
+    count, at = counts.unfold(0, WINDOW, 1).sum(-1).max(0)
+    return int(count), float(((at + WINDOW / 2) * step + low).exp())
 
 
 def _refined(
@@ -190,15 +179,16 @@ def _refined(
         depth: The cameras' height above it, the measure of what is near.
         tilt: Turn the normal, too.
     """
-    for k in range(REFINEMENTS):
-        near = points[(points @ normal - height).abs() < 0.15 * depth / (k + 1)]
+    most = math.cos(math.radians(MOST_TILT_DEG))
+    upright = normal
+    for share in NEAR_SHARES:
+        near = points[(points @ normal - height).abs() < share * depth]
         if len(near) < CLEAR_POINTS:
             break
         if tilt:
-            spread, axes = torch.linalg.svd(near - near.mean(0), full_matrices=False)[1:]
-            flat = axes[2] * torch.sign(axes[2] @ normal)
-            on_a_line = spread[1] < 3 * spread[2]  # which many planes hold
-            if on_a_line or float(flat @ normal) < math.cos(math.radians(MOST_TILT_DEG)):
+            flat = torch.linalg.svd(near - near.mean(0), full_matrices=False)[2][2]
+            flat = flat * torch.sign(flat @ upright)
+            if float(flat @ upright) < most:  # no floor, or a strip of it, which any plane holds
                 break
             normal = flat
         height = float((near @ normal).median())

@@ -33,9 +33,8 @@ def clearance_of(occupancy: OccupancyMap, config: PlanConfig) -> Clearance:
         blocked = blocked | (states == UNKNOWN)
     padded = np.pad(blocked, 1, constant_values=outside)
     cells = cv2.distanceTransform((~padded).view(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)[1:-1, 1:-1]
-    distance = np.float32(occupancy.resolution) * np.clip(
-        cells - np.float32(0.5), 0, np.float32(np.hypot(*states.shape))
-    )
+    diagonal = np.float32(np.hypot(*states.shape))
+    distance = np.float32(occupancy.resolution) * np.clip(cells - np.float32(0.5), 0, diagonal)
     weight = np.ones(states.shape, np.float32)
     if config.margin > 0 and config.clearance_weight > 0:
         near = 1 - (distance - np.float32(config.robot_radius)) * np.float32(1 / config.margin)

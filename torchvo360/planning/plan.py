@@ -159,4 +159,5 @@ def _place(occupancy: OccupancyMap, row: int, column: int) -> tuple[float, float
 
 
 def _at(place: tuple[float, float]) -> str:
-    return f"({place[0]:.4g}, {place[1]:.4g})"
+    x, y = (round(value, 6) + 0.0 for value in place)  # neither 1e-28 nor -0
+    return f"({x:.4g}, {y:.4g})"

@@ -14,7 +14,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from torchvo360.cameras import Camera
+from torchvo360.cameras import Camera, Equirectangular
 from torchvo360.checks import InputError
 from torchvo360.data.frame import Frame
 from torchvo360.viz.report.pictures import encoded, picture_size
@@ -38,6 +38,11 @@ def can_record() -> bool:
     return importlib.util.find_spec("rerun") is not None
 
 
+def image_of(camera: Camera) -> str:
+    """Return where the images go: before the camera for a pinhole, beside the world for a panorama."""
+    return "image" if isinstance(camera, Equirectangular) else "world/camera/image"
+
+
 class LiveView:
     """Sends a run to Rerun, frame by frame."""
 
@@ -53,11 +58,11 @@ class LiveView:
         import rerun  # pyright: ignore[reportMissingImports]
 
         self._rr, self._recording, self._files = rerun, recording, (temporary, final)
-        self._image = "image" if camera.wraps else "world/camera/image"
+        self._image = image_of(camera)
         self._said = ""
         self._keyframes: set[int] = set()
         recording.log("world", rerun.ViewCoordinates.RDF, static=True)
-        if not camera.wraps:
+        if not isinstance(camera, Equirectangular):
             width, height = picture_size(camera.width, camera.height)
             fx, fy, cx, cy = camera.intrinsics
             sx, sy = width / camera.width, height / camera.height
@@ -153,7 +158,7 @@ def live_view(viz: str, path: Path, name: str, camera: Camera) -> Iterator[LiveV
 def _layout(camera: Camera) -> "Blueprint":
     import rerun.blueprint as layout  # pyright: ignore[reportMissingImports]
 
-    image = layout.Spatial2DView(origin="image" if camera.wraps else "world/camera/image", name="Image")
+    image = layout.Spatial2DView(origin=image_of(camera), name="Image")
     values = [layout.TimeSeriesView(origin=f"values/{name}", name=name) for name in VALUES]
     states = layout.TextLogView(origin="states", name="States")
     world = layout.Spatial3DView(origin="world", name="World")

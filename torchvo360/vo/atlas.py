@@ -19,6 +19,7 @@ from torchvo360.loop import PoseGraph, PoseGraphConfig, carry_poses, odometry_in
 from torchvo360.vo.keyframes.cloud import PointCloud, join_clouds
 from torchvo360.vo.keyframes.mapper import Mapper
 from torchvo360.vo.loops import LoopEdge
+from torchvo360.vo.smooth import Standing
 from torchvo360.vo.state import FrameEstimate
 
 UNMEASURED = {"residual": math.nan, "inliers": math.nan, "a": math.nan, "b": math.nan}
@@ -111,21 +112,28 @@ class Atlas:
             self.oldest[map] = self.oldest[older]
         return True
 
+    def scale_of(self, map: int) -> float:
+        """Return the world's units in one unit of a map."""
+        return float(torch.linalg.det(self.S_world_map[map][:3, :3])) ** (1 / 3)
+
     def rescale(self, scale: float) -> None:
-        """Give the present map's unit this many metres, about its first keyframe; a map joined to another stays.
+        """Give the present map's unit this many of the world's, and with it all maps that it is joined with.
+
+        The oldest keyframe among them stays where it is.
 
         Args:
-            scale: Metres of one unit of the map, in place of what was said before.
+            scale: In place of what it was before.
         """
         map = self.sessions[-1].map
-        if self.oldest[map] != map:
-            return
-        first = next(session.mapper for session in self.sessions if session.map == map).poses()
-        centre = first[min(first)][:3, 3]
+        factor, group = scale / self.scale_of(map), self.oldest[map]
+        first = next(session.mapper for session in self.sessions if session.map == group).poses()
+        centre = (self.S_world_map[group] @ first[min(first)])[:3, 3]
         S = torch.eye(4, dtype=torch.float64)
-        S[:3, :3] *= scale
-        S[:3, 3] = (1 - scale) * centre
-        self.S_world_map[map] = S
+        S[:3, :3] *= factor
+        S[:3, 3] = (1 - factor) * centre
+        for at, oldest in enumerate(self.oldest):
+            if oldest == group:
+                self.S_world_map[at] = S @ self.S_world_map[at]
 
     def keyframes(self) -> dict[int, Float64[Tensor, "4 4"]]:
         """Return S_world_key of all keyframes, by frame index."""
@@ -186,6 +194,30 @@ class Atlas:
             # Of its own: a view would keep all poses alive with any one of them.
             out[at] = replace(out[at], T_world_cam=T_world_cam.clone())
         return out
+
+    def standing(self, S_world_key: dict[int, Float64[Tensor, "4 4"]], points: PointCloud) -> dict[int, Standing]:
+        """Return what each frame stands on, by frame index.
+
+        Args:
+            S_world_key: Of all keyframes.
+            points: All points in the world.
+        """
+        groups = {key: self.oldest[s.map] for s in self.sessions for key in s.mapper.poses() if key in S_world_key}
+        keys = torch.tensor(sorted(groups), dtype=torch.int64)
+        centre = torch.stack([S_world_key[int(key)][:3, 3] for key in keys]) if len(keys) else torch.zeros(0, 3)
+        at = torch.searchsorted(keys, points.frame.long())
+        distance = torch.linalg.vector_norm(points.xyz - centre[at], dim=-1)
+        group = torch.tensor([groups[int(key)] for key in keys], dtype=torch.int64)[at]
+        ranges = {
+            number: float(distance[group == number].median()) if bool((group == number).any()) else 1.0
+            for number in set(groups.values())
+        }
+        scales = {key: float(torch.linalg.det(S_world_key[key][:3, :3])) ** (1 / 3) for key in groups}
+        return {
+            index: Standing(groups[key], scales[key], ranges[groups[key]])
+            for index, (key, _) in self.anchors.items()
+            if key in groups
+        }
 
     def points(self, S_world_key: dict[int, Float64[Tensor, "4 4"]]) -> PointCloud:
         """Return the points of all maps in the world."""

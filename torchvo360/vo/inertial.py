@@ -15,7 +15,7 @@ from torch import Tensor
 from torchvo360 import lie
 from torchvo360.alignment import PosePrior
 from torchvo360.checks import InputError, check_finite_number
-from torchvo360.inertial import ImuSensor, predict, preintegrate
+from torchvo360.inertial import ImuSensor, compose, predict, preintegrate
 from torchvo360.inertial.initialise import InertialStartConfig, initialise
 from torchvo360.inertial.offset import estimate_offset
 from torchvo360.residuals.inertial import Preintegrated
@@ -36,6 +36,8 @@ LOST_SIGMA = 1.0
 """Of the velocity after the samples had a gap, m/s."""
 METRIC_SIGMA = (0.01, 3e-3, 3e-3)
 """Of log-scale and the angles of gravity when a map that has them is taken up again."""
+HELD_SIGMA = 1e-3
+"""Of the log-scale of a map that is in metres already, by a rig or a depth sensor."""
 DOUBT = 3.0
 """Scale and gravity are believed this much less than they claim then: the window's own samples are among those that
 told them."""
@@ -81,6 +83,16 @@ class Place(NamedTuple):
     """In the map's axes and unit."""
 
 
+class _SinceKey(NamedTuple):
+    """What was measured since the newest keyframe, as far as frames have been placed."""
+
+    key_ns: int
+    until_ns: int
+    bias: Float64[Tensor, "6"]
+    pre: Preintegrated
+    """A batch of one."""
+
+
 class Foreseen(NamedTuple):
     """Where a frame is expected."""
 
@@ -105,8 +117,11 @@ class InertialLink:
         self.sensor, self.config, self._noise = sensor, config, noise
         self.bias = torch.zeros(6, dtype=torch.float64)
         """Of gyro and accelerometer, the last known."""
+        self.reason = ""
+        """Why scale and gravity are not known; empty before they were sought, and where they are."""
         self._turned: list[tuple[int, Float64[Tensor, "3 3"]]] = []
         self._span_ns = 0
+        self._since: _SinceKey | None = None
 
     def between(self, times_ns: list[int], bias: Float64[Tensor, "*B 6"]) -> Preintegrated:
         """Return what was measured from each of the camera's times to the next."""
@@ -123,7 +138,7 @@ class InertialLink:
 
     def begin_map(self) -> None:
         """Forget what was noted: another map has axes of its own."""
-        self._turned, self._span_ns = [], 0
+        self._turned, self._span_ns, self._since = [], 0, None
 
     def retimed(self) -> bool:
         """Estimate the offset of the clocks where there is twice as much to tell it; return whether that changed it."""
@@ -135,8 +150,20 @@ class InertialLink:
         found = estimate_offset(torch.stack(turns), torch.tensor(times, dtype=torch.int64), self.sensor)
         if not found.ok or abs(found.offset_s - self.sensor.offset_s) < SURELY * found.deviation_s:
             return False
-        self.sensor = replace(self.sensor, offset_s=found.offset_s)
+        self.sensor, self._since = replace(self.sensor, offset_s=found.offset_s), None
         return True
+
+    def _since_key(self, key_ns: int, until_ns: int, bias: Float64[Tensor, "6"]) -> Preintegrated:
+        """Return the motion since the newest keyframe, a batch of one; most of it is known from the frame before."""
+        last = self._since
+        if last is None or last.key_ns != key_ns or last.until_ns > until_ns or not torch.equal(last.bias, bias):
+            pre = self.between([key_ns, until_ns], bias)
+        elif last.until_ns == until_ns:
+            return last.pre
+        else:
+            pre = compose(last.pre, self.between([last.until_ns, until_ns], bias))
+        self._since = _SinceKey(key_ns, until_ns, bias, pre)
+        return pre
 
     # Prediction
 
@@ -150,25 +177,22 @@ class InertialLink:
             t_ns: The frame's time.
         """
         bias = self._bias_of(window)
-        pre = self.between([key_ns, placed.t_ns, t_ns], bias)
-        if not bool(pre.ok[1]):
+        pre = self.between([placed.t_ns, t_ns], bias)
+        if not bool(pre.ok):
             return None
         T_cam_imu, R_cam_world = self.sensor.T_cam_imu, placed.T_cam_world[:3, :3]
-        R_cam_imu = T_cam_imu[:3, :3]
-        spread = pre.covariance[1, :3, :3] + (BIAS_SIGMA * float(pre.dt[1])) ** 2 * torch.eye(3, dtype=torch.float64)
-        rotation = R_cam_imu @ spread @ R_cam_imu.mT + PLACED_SIGMA**2 * torch.eye(3, dtype=torch.float64)
-        metric, motion = window.metric, window.frames[-1].motion
-        moved = placed.t_ns > key_ns
-        if metric is None or motion is None or (moved and not bool(pre.ok[0])):
-            R = R_cam_imu @ pre.dR[1].mT @ R_cam_imu.mT @ R_cam_world
+        R_cam_imu, eye = T_cam_imu[:3, :3], torch.eye(3, dtype=torch.float64)
+        spread = pre.covariance[0, :3, :3] + (BIAS_SIGMA * float(pre.dt)) ** 2 * eye
+        rotation = R_cam_imu @ spread @ R_cam_imu.mT + PLACED_SIGMA**2 * eye
+        velocity = self.velocity_at(window, key_ns, placed.t_ns)
+        if velocity is None or window.metric is None:
+            R = R_cam_imu @ pre.dR[0].mT @ R_cam_imu.mT @ R_cam_world
             centre = -R_cam_world.mT @ placed.T_cam_world[:3, 3]
             return Foreseen(lie.se3(R, -R @ centre), rotation, False)
-        scale, gravity, velocity = metric.log_scale.exp(), metric.gravity, motion[:3]
-        if moved:
-            T_world_imu = _to_imu(window.frames[-1].T_cam_world, T_cam_imu, scale)
-            _, velocity = predict(T_world_imu, velocity, pre.take(0), gravity)
-        T_world_imu, _ = predict(_to_imu(placed.T_cam_world, T_cam_imu, scale), velocity, pre.take(1), gravity)
-        return Foreseen(_to_camera(T_world_imu, T_cam_imu, scale), rotation, True)
+        scale, gravity = window.metric.log_scale.exp(), window.metric.gravity
+        T_world_imu, _ = predict(_to_imu(placed.T_cam_world, T_cam_imu, scale), velocity, pre.take(0), gravity)
+        T_cam_world = _to_camera(T_world_imu, T_cam_imu, scale)
+        return Foreseen(T_cam_world, rotation, True) if bool(torch.isfinite(T_cam_world).all()) else None
 
     def prior(self, foreseen: Foreseen, T_key_world: Float64[Tensor, "4 4"]) -> PosePrior | None:
         """Return what a prediction says of a frame's rotation, against its keyframe."""
@@ -195,13 +219,16 @@ class InertialLink:
 
     # Coupling
 
-    def couple(self, window: Window, T_cam_world: Float64[Tensor, "N 4 4"], times_ns: list[int]) -> bool:
+    def couple(
+        self, window: Window, T_cam_world: Float64[Tensor, "N 4 4"], times_ns: list[int], *, metric: bool
+    ) -> bool:
         """Find scale, gravity, velocities and biases from a map's keyframes, and couple its window, if they tell.
 
         Args:
             window: The map's.
             T_cam_world: The map's keyframes, the oldest first; the last are those in the window.
             times_ns: Their times.
+            metric: Whether the map is in metres already: its scale is then held.
         """
         if len(times_ns) < self.config.min_keyframes or times_ns[-1] - times_ns[0] < self.config.min_seconds * 1e9:
             return False
@@ -213,17 +240,21 @@ class InertialLink:
             max_gap_s=config.max_gap_s,
         )
         start = initialise(T_cam_world, torch.tensor(times_ns, dtype=torch.int64), self.sensor, settings)
+        self.reason = start.reason
         if not start.ok:
             return False
-        motions = start.motions[-K:]
+        motions = start.motions[-K:].clone()
         segments = self.between(times_ns[-K:], motions[:-1, 3:])
         none = torch.zeros(2, dtype=torch.float64)
-        told = start.covariance.diagonal().sqrt()
+        told, log_scale = DOUBT * start.covariance.diagonal().sqrt(), start.log_scale
+        if metric:
+            motions[:, :3] /= log_scale.exp()
+            told[0], log_scale = HELD_SIGMA, torch.zeros_like(log_scale)
         window.couple(
             Coupling(self.sensor.T_cam_imu, self.sensor.noise, config.intensity**2, segments),
-            Metric(start.log_scale, none, start.gravity),
+            Metric(log_scale, none, start.gravity),
             motions,
-            1 / torch.cat([told.new_tensor(START_SIGMA).repeat_interleave(3), DOUBT * told]).square(),
+            1 / torch.cat([told.new_tensor(START_SIGMA).repeat_interleave(3), told]).square(),
         )
         self.bias = motions[-1, 3:]
         return True
@@ -253,10 +284,11 @@ class InertialLink:
 
     def velocity_at(self, window: Window, key_ns: int, t_ns: int) -> Float64[Tensor, "3"] | None:
         """Return the velocity that the samples have carried on from a window's newest keyframe; None without them."""
-        segment = self.between([key_ns, t_ns], self._bias_of(window))
-        if window.metric is None or not bool(segment.ok[0]):
-            return None
-        return self.motion_after(window, segment)[:3]
+        motion = window.frames[-1].motion
+        if window.metric is None or motion is None or t_ns <= key_ns:
+            return None if motion is None else motion[:3]
+        segment = self._since_key(key_ns, t_ns, self._bias_of(window))
+        return self.motion_after(window, segment)[:3] if bool(segment.ok) else None
 
 
 def _to_imu(T_cam_world: Tensor, T_cam_imu: Tensor, scale: Tensor) -> Float64[Tensor, "4 4"]:

@@ -36,7 +36,7 @@ from torchvo360.vo.loops import LoopCloser, LoopEdge
 from torchvo360.vo.recover import Recovery
 from torchvo360.vo.sensor import check_depth
 from torchvo360.vo.smooth import smoothed
-from torchvo360.vo.start.begin import Begun, Starter
+from torchvo360.vo.start.begin import LEARNED, Begun, Starter
 from torchvo360.vo.start.learned import LearnedRanges
 from torchvo360.vo.start.stereo import StereoRanges, check_others, check_rig
 from torchvo360.vo.state import FrameEstimate, State
@@ -61,10 +61,14 @@ class OdometryResult:
     """Maps begun; more than one after losses."""
     intrinsics: tuple[float, float, float, float] | None = None
     """(fx, fy, cx, cy) as estimated, pixels; None where they were taken as given."""
+    metric: bool = False
+    """Whether the unit is the metre: by a rig, a depth sensor, an IMU or a depth network."""
     gravity: tuple[float, float, float] | None = None
     """In the world's axes, m/s^2, as the IMU told; None without it, or where the motion did not tell."""
     imu_offset_s: float | None = None
     """What was added to the IMU's times; None without one."""
+    imu_reason: str = ""
+    """A sentence on why an IMU told neither scale nor gravity."""
 
 
 class VisualOdometry:
@@ -123,7 +127,6 @@ class VisualOdometry:
         if rig is not None:
             stereo = StereoRanges(self._builder, config.map, config.trace, config.window, config.track.min_points)
         self._imu = None if imu is None else InertialLink(imu, config.inertial, config.track.noise)
-        self._metric = rig is not None
         self._metrics: dict[int, Metric] = {}
         """Scale and gravity by map, as the IMU told."""
         self._starter = Starter(self._builder, config, torch.Generator().manual_seed(seed), learned, stereo)
@@ -160,24 +163,31 @@ class VisualOdometry:
         if self._follower is not None:
             loops += self._loops.search(self._follower.mapper.references())
         before = atlas.keyframes()
-        after = atlas.corrected(loops, self.config.loop.graph, metric=self._metric)
-        frames, earlier = atlas.final(after), atlas.final(before)
+        metric = self._is_metric()
+        after = atlas.corrected(loops, self.config.loop.graph, metric=metric)
+        frames, earlier, points = atlas.final(after), atlas.final(before), atlas.points(after)
         if self.config.smooth:
-            scales = {key: float(torch.linalg.det(S[:3, :3]).pow(1 / 3)) for key, S in after.items()}
-            by_frame = {index: scales[key] for index, (key, _) in atlas.anchors.items() if key in scales}
-            frames = smoothed(frames, by_frame, self.config.motion)
+            frames = smoothed(frames, atlas.standing(after, points), self.config.motion)
         return OdometryResult(
             frames=frames,
             trajectory=_trajectory(frames),
-            points=atlas.points(after),
+            points=points,
             keyframes=len(after),
             before_loops=_trajectory(earlier),
             loops=loops,
             maps=len(atlas.S_world_map),
             intrinsics=self._builder.cameras[0].intrinsics if self.config.window.calibrate else None,
+            metric=metric or any(estimate.reason == LEARNED for estimate in frames),
             gravity=self._gravity(),
             imu_offset_s=None if self._imu is None else self._imu.sensor.offset_s,
+            imu_reason="" if self._imu is None or self._metrics else self._imu.reason,
         )
+
+    def _is_metric(self) -> bool:
+        """Return whether the first map, with those joined to it, is in metres: by a rig, a sensor or an IMU."""
+        atlas = self._atlas
+        first = [session for session in atlas.sessions if atlas.oldest[session.map] == 0]
+        return any(session.mapper.metric or session.map in self._metrics for session in first)
 
     def _gravity(self) -> tuple[float, float, float] | None:
         """Return gravity in the world, by the oldest map that knows it."""
@@ -234,7 +244,6 @@ class VisualOdometry:
             atlas.begin(begun.mapper, map=atlas.sessions[-1].map, after=max(earlier, default=None))
         else:
             atlas.begin(begun.mapper)
-        self._metric = self._metric or begun.mapper.metric
         atlas.fill_in(begun.key, begun.T_key_cam)
         self._remembered_before, self._cameras_before = len(self._recovery), self._builder.cameras
         for key in begun.mapper.references()[:-1]:
@@ -269,9 +278,7 @@ class VisualOdometry:
         if (begun := self._starter.watch(frame, follower.T_map_cam)) is not None:
             return self._take_over(begun, frame)
         if (metric := follower.mapper.window.metric) is not None:
-            map = self._atlas.sessions[-1].map
-            self._metric, self._metrics[map] = True, metric
-            self._atlas.rescale(float(metric.log_scale.exp()))
+            self._measured(follower, metric)
         joined = [self._atlas.join(edge) for key in follower.left for edge in self._loops.add(key)]
         T_world_cam = self._atlas.in_world(follower.T_map_cam)
         was_lost, self._lost = self._lost > 0, 0
@@ -281,6 +288,14 @@ class VisualOdometry:
             return _estimate(frame, T_world_cam, State.WEAK, "low_agreement", found)
         state, reason = (State.RELOCALISED, "present_keyframe") if was_lost else (State.TRACKING, "ok")
         return _estimate(frame, T_world_cam, state, reason, found)
+
+    def _measured(self, follower: Follower, metric: Metric) -> None:
+        """Take in what the IMU says of the present map: its scale, unless that is known otherwise."""
+        map = self._atlas.sessions[-1].map
+        self._metrics[map] = metric
+        oldest = self._atlas.oldest[map]
+        if not follower.mapper.metric and (map == oldest or oldest not in self._metrics):
+            self._atlas.rescale(float(metric.log_scale.exp()))
 
     def _predict(self, frame: Frame) -> FrameEstimate:
         reason = f"bad_frame_{frame.problem or 'unreadable'}"
@@ -301,7 +316,7 @@ class VisualOdometry:
         if self._starter.confirming:
             # Lost before the start was confirmed: a wrong start ends so, and nothing may be found again in its map.
             T_world_cam = self._atlas.in_world(follower.T_map_cam)
-            unit = follower.median_rho()
+            unit = self._unit(follower)
             self._forget_map()
             self._starter.restart(T_world_cam, unit)
             return self._begin(self._as_before(frame))
@@ -315,15 +330,22 @@ class VisualOdometry:
         T_world_cam = self._atlas.in_world(follower.T_map_cam)
         if self._lost < self.config.restart_after or follower.carried:
             return _estimate(frame, T_world_cam, State.LOST, "no_agreement", None)
-        unit = follower.median_rho()
+        unit = self._unit(follower)
         self._retire(follower)
         self._follower = None
         self._starter.restart(T_world_cam, unit)
         begun = self._starter.add(frame)
         return self._take_over(begun, frame) if begun else _estimate(frame, T_world_cam, State.LOST, "restarting", None)
 
+    def _unit(self, follower: Follower) -> float:
+        """Return the median inverse distance that a follower sees, in the world's unit."""
+        return follower.median_rho() / self._atlas.scale_of(self._atlas.sessions[-1].map)
+
     def _forget_map(self) -> None:
         """Take back the present map, which turned out wrong, and all that was kept of it."""
+        gone = self._atlas.sessions[-1].map
+        if sum(session.map == gone for session in self._atlas.sessions) == 1:
+            self._metrics.pop(gone, None)
         self._recovery.forget(self._remembered_before)
         self._loops.forget(set(self._atlas.sessions[-1].mapper.poses()))
         self._atlas.drop_session()

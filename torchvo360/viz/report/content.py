@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from torchvo360.cameras import Camera
+from torchvo360.cameras import Camera, Equirectangular
 from torchvo360.checks import InputError
 from torchvo360.data.trajectory import Trajectory
 from torchvo360.lie import quaternion_from_matrix, se3
@@ -79,7 +79,7 @@ def document(content: Content) -> dict[str, Any]:
         "name": content.name,
         "unit": "m" if content.metric or truth is not None else "units",
         "camera": {
-            "panorama": content.camera.wraps,
+            "panorama": isinstance(content.camera, Equirectangular),
             "width": content.camera.width,
             "height": content.camera.height,
             "intrinsics": list(content.camera.intrinsics),

@@ -10,7 +10,6 @@ import json
 from pathlib import Path
 from typing import Any
 
-from torchvo360.checks import InputError
 from torchvo360.files import atomic_path
 from torchvo360.viz.report.content import Content, document
 from torchvo360.viz.report.pictures import Picture
@@ -38,18 +37,14 @@ def write_report(path: str | Path, content: Content, *, most_bytes: int = 12_000
     Args:
         path: The file; it appears only when it is complete.
         content: What it shows.
-        most_bytes: Its size; pictures are left out, every other one, until it has no more.
+        most_bytes: Pictures are left out, every other one, until the page has no more than this, or no picture.
 
     Raises:
-        InputError: There are no frames, or truth is given and fewer than three poses have a true one; or what is to be
-            shown is larger without a picture.
+        InputError: Truth is given, and fewer than three poses have a true one.
         OSError: The file cannot be written.
     """
     shown = document(content)
-    frames_only = _filled(content.name, shown | {"pictures": []})
-    room = most_bytes - len(frames_only.encode())
-    if room < 0:
-        raise InputError(f"report_mb: expected at least {len(frames_only) / 1e6:.1f}, got {most_bytes / 1e6:g}.")
+    room = most_bytes - len(_filled(content.name, shown | {"pictures": []}).encode())
     pictures = _encoded(list(content.pictures))
     while pictures and sum(len(json.dumps(picture)) + 2 for picture in pictures) > room:
         pictures = pictures[::2] if len(pictures) > 1 else []

@@ -153,7 +153,8 @@ class Mapper:
         poses = self.poses()
         keys = sorted(poses)[-MOST_COUPLED:]
         T_cam_world = lie.se3_inverse(torch.stack([poses[key] for key in keys]))
-        return imu.couple(self.window, T_cam_world, [self.times_ns[key] for key in keys])
+        times_ns = [self.times_ns[key] for key in keys]
+        return imu.couple(self.window, T_cam_world, times_ns, metric=self.metric)
 
     def _adjust(self, steps: int | None = None) -> None:
         """Optimise the window; where that estimates the intrinsics, all that follows uses the new ones."""

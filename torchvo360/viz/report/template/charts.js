@@ -155,7 +155,7 @@ function drawStrip(canvas) {
   for (const { state, from, to } of stateStretches) {
     context.fillStyle = stateColour(frames.states[state]);
     // by rows, as the slider counts
-    const left = ((from - 0.5) / Math.max(frames.count - 1, 1)) * width, right = ((to + 0.5) / Math.max(frames.count - 1, 1)) * width;
-    context.fillRect(left, 0, Math.max(right - left, 1.5), height);
+    const step = frames.count > 1 ? width / (frames.count - 1) : 2 * width;
+    context.fillRect((from - 0.5) * step, 0, Math.max((to - from + 1) * step, 1.5), height);
   }
 }

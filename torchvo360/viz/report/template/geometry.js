@@ -65,8 +65,9 @@ function extent(clouds) {
       low[axis] = Math.min(low[axis], quantile(values, share));
       high[axis] = Math.max(high[axis], quantile(values, 1 - share));
     }
-  const size = [0, 1, 2].map((axis) => high[axis] - low[axis]);
-  return { low, high, size, middle: [0, 1, 2].map((axis) => (low[axis] + high[axis]) / 2), radius: Math.max(Math.hypot(...size) / 2, 1e-6) };
+  const size = [0, 1, 2].map((axis) => high[axis] - low[axis]), radius = Math.hypot(...size) / 2;
+  const middle = [0, 1, 2].map((axis) => (low[axis] + high[axis]) / 2);
+  return { low, high, size, middle, radius: radius > 1e-9 ? radius : 1 }; // a single place has any size
 }
 
 // The largest of 1, 2 and 5 times a power of ten that is at most this.

@@ -187,11 +187,15 @@ function listen(canvas, moves) {
     const box = canvas.getBoundingClientRect();
     return [event.clientX - box.left, event.clientY - box.top];
   };
+  const distance = () => {
+    const [p, q] = [...pointers.values()];
+    return Math.hypot(p[0] - q[0], p[1] - q[1]);
+  };
   canvas.addEventListener("pointerdown", (event) => {
     canvas.setPointerCapture(event.pointerId);
     pointers.set(event.pointerId, place(event));
     began = pointers.size === 1 ? { at: place(event), still: true, pan: event.shiftKey || event.button > 0 } : null;
-    gap = 0;
+    gap = pointers.size === 2 ? distance() : 0;
   });
   canvas.addEventListener("pointermove", (event) => {
     const before = pointers.get(event.pointerId);
@@ -199,7 +203,7 @@ function listen(canvas, moves) {
     const now = place(event), dx = now[0] - before[0], dy = now[1] - before[1];
     pointers.set(event.pointerId, now);
     if (pointers.size === 2) {
-      const [p, q] = [...pointers.values()], wide = Math.hypot(p[0] - q[0], p[1] - q[1]);
+      const [p, q] = [...pointers.values()], wide = distance();
       if (gap) moves.zoom(gap / Math.max(wide, 1), (p[0] + q[0]) / 2, (p[1] + q[1]) / 2);
       gap = wide;
       moves.pan?.(dx / 2, dy / 2);

@@ -176,7 +176,7 @@ function markChange(row) {
 // What is known of the whole
 element("name").textContent = content.name;
 element("subtitle").textContent =
-  `${thousands(frames.count)} frames of ${content.camera.width} × ${content.camera.height}, ${duration(frames.seconds[frames.count - 1], 1)}`;
+  `${thousands(frames.count)} ${frames.count === 1 ? "frame" : "frames"} of ${content.camera.width} × ${content.camera.height}, ${duration(frames.seconds[frames.count - 1], 1)}`;
 
 function figure(value, after) {
   const node = made("dd", value);
@@ -227,7 +227,7 @@ const about = [
 ];
 for (const [term, text] of about) if (text) element("run").append(made("dt", term), made("dd", text));
 
-const settingRows = content.settings.map(([name, value, usual]) => {
+const settingRows = [...content.settings].sort((p, q) => p[2] - q[2]).map(([name, value, usual]) => {
   const line = made("tr", undefined, usual ? undefined : "changed");
   line.append(made("td", name), made("td", value));
   return line;

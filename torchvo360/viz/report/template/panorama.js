@@ -8,18 +8,24 @@ void main() {
   gl_Position = vec4(screen, 0.0, 1.0);
 }`;
 
-// Each pixel's ray becomes longitude and latitude: lon = atan(x, z), lat = asin(-y), rows from the upper pole.
+// Each pixel's ray becomes longitude and latitude: lon = atan(x, z), lat = asin(-y); u = fx lon + cx, v = fy lat + cy, as
+// shares of the image's size. A panorama of less than the sphere leaves the ground as it is.
 const PANORAMA_FRAGMENT = `#version 300 es
 precision highp float;
 in vec2 screen;
 uniform sampler2D image;
 uniform mat3 cam_look;
 uniform vec2 reach;
+uniform vec4 intrinsics;
 out vec4 pixel;
-const float PI = 3.14159265358979;
+const float TAU = 6.28318530717959;
 void main() {
   vec3 ray = normalize(cam_look * vec3(screen * reach, 1.0));
-  pixel = vec4(texture(image, vec2(atan(ray.x, ray.z) / (2.0 * PI) + 0.5, 0.5 + asin(clamp(ray.y, -1.0, 1.0)) / PI)).rgb, 1.0);
+  vec2 angles = vec2(atan(ray.x, ray.z), asin(clamp(-ray.y, -1.0, 1.0)));
+  vec2 place = angles * intrinsics.xy + intrinsics.zw;
+  place.x = mod(place.x, TAU * intrinsics.x);
+  if (max(place.x, place.y) > 1.0001 || place.y < -0.0001) discard;
+  pixel = vec4(texture(image, place).rgb, 1.0);
 }`;
 
 class Pictures {
@@ -154,6 +160,8 @@ class Panorama {
     gl.bindTexture(gl.TEXTURE_2D, this.texture);
     gl.uniformMatrix3fv(uniforms.cam_look, false, [look.right, look.up, look.ahead].flatMap((axis) => turnedBack(R, axis)));
     gl.uniform2fv(uniforms.reach, reach);
+    const [fx, fy, cx, cy] = content.camera.intrinsics, { width, height } = content.camera;
+    gl.uniform4f(uniforms.intrinsics, fx / width, fy / height, cx / width, cy / height);
     gl.drawArrays(gl.TRIANGLE_STRIP, 0, 4);
     if (this.overlay) this.drawOverlay(look, pathAt(row), reach, ratio);
   }

@@ -378,7 +378,7 @@ class TestConventions:
         close(quarter @ forward, right, 1e-15)
 
     def test_relative_perturbations_of_two_frames_chain_through_the_adjoint(self):
-        """With T_ji = T_j T_i^-1, both perturbed from the left, d/dxi_i = -d/dxi_j Ad(T_ji) (equations.md, 6)."""
+        """With T_ji = T_j T_i^-1, both perturbed from the left, d/dxi_i = -d/dxi_j Ad(T_ji) (mathematics.md, 6)."""
         T_i, T_j = (lie.se3_exp(random_tangents((), torch.float64, seed=seed)) for seed in (21, 22))
         p_i = torch.tensor([0.4, -1.3, 2.2, 1.0], dtype=torch.float64)
         zero = torch.zeros(6, dtype=torch.float64)

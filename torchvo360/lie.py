@@ -1,7 +1,7 @@
 """SO(3), SE(3) and Sim(3) on plain tensors: hat, exp, log, adjoint, and quaternions.
 
 Tangents are `[w]`, `[v, w]` and `[v, w, s]`: translation first, then rotation, then log-scale. `T_b_a` maps points of
-frame a into frame b and updates multiply from the left, `T <- exp(xi) @ T` (equations.md, section 1). Every function
+frame a into frame b and updates multiply from the left, `T <- exp(xi) @ T` (mathematics.md, section 1). Every function
 takes any batch shape and has finite gradients at the identity; logarithms are accurate up to and at an angle of pi.
 """
 
@@ -173,7 +173,7 @@ def se3_normalized(T: Float[Tensor, "*batch 4 4"]) -> Float[Tensor, "*batch 4 4"
 
 
 def se3_adjoint(T: Float[Tensor, "*batch 4 4"]) -> Float[Tensor, "*batch 6 6"]:
-    """Return Ad with `T @ exp(xi) @ T^-1 == exp(Ad @ xi)`: [[R, hat(t) R], [0, R]] (equations.md, section 6)."""
+    """Return Ad with `T @ exp(xi) @ T^-1 == exp(Ad @ xi)`: [[R, hat(t) R], [0, R]] (mathematics.md, section 6)."""
     check_shape("T", T, "... 4 4")
     R, t = T[..., :3, :3], T[..., :3, 3]
     top = torch.cat([R, so3_hat(t) @ R], -1)

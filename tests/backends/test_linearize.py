@@ -1,6 +1,6 @@
 """`linearize` equals float64 sums of textbook rows, for every pair alone, whatever the batch, the chunks and the input.
 
-The oracle forms each pixel's Jacobian by the chain rule through pixels (equations.md, section 4 for the sphere), not
+The oracle forms each pixel's Jacobian by the chain rule through pixels (mathematics.md, section 4 for the sphere), not
 by the covector, and sums in float64 at the pixels that the float32 kernel looked up.
 """
 
@@ -77,7 +77,7 @@ def in_float64(reference: Reference, target: Target) -> tuple[Reference, Target]
 
 
 def pixel_slopes(camera: Camera, Y: Float[Tensor, "N 3"], rho: Float[Tensor, "N"]) -> Float[Tensor, "N 2 6"]:
-    """d(u, v) / d(v, w) as written out in equations.md, section 4, and S2's pinhole counterpart."""
+    """d(u, v) / d(v, w) as written out in mathematics.md, section 4, and S2's pinhole counterpart."""
     fx, fy, _, _ = camera.intrinsics
     o = torch.zeros_like(rho)
     if isinstance(camera, Pinhole):

@@ -1,7 +1,7 @@
 """The contract of a camera, held by every one of them: round trips, derivatives, singular points, areas.
 
-Each camera has a model of its own in `reference_pixel` and `reference_ray`, written from equations.md, section 2, with
-its intrinsics as a tensor, so that every closed form is held to forward-mode derivatives of something else.
+Each camera has a model of its own in `reference_pixel` and `reference_ray`, written from mathematics.md, section 2,
+with its intrinsics as a tensor, so that every closed form is held to forward-mode derivatives of something else.
 """
 
 import math
@@ -375,7 +375,7 @@ class TestCovector:
 
 
 class TestKernel:
-    """The rows of every alignment (equations.md, sections 3 and 4) from nothing but the contract."""
+    """The rows of every alignment (mathematics.md, sections 3 and 4) from nothing but the contract."""
 
     @pytest.fixture
     def motion(self) -> Float[Tensor, "4 4"]:

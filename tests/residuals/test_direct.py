@@ -1,6 +1,6 @@
 """The tangent-form rows equal the derivative of a textbook warp, hard points included.
 
-The oracle is written apart: points are moved by a matrix exponential, projected by the formulas of equations.md,
+The oracle is written apart: points are moved by a matrix exponential, projected by the formulas of mathematics.md,
 section 2, and looked up by a bilinear interpolation of its own; `jacfwd` differentiates all of it.
 """
 

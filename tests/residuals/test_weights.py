@@ -107,7 +107,7 @@ def test_the_weight_by_depth_and_its_slope(batch):
     slope_of_image = torch.randn(batch, generator=generator, dtype=torch.float64).requires_grad_()
     variance, noise = torch.rand(batch, generator=generator, dtype=torch.float64), 0.03
     weight, slope = depth_variance_weight(slope_of_image, variance, noise)
-    # equations.md, section 5, relative to exact depth.
+    # mathematics.md, section 5, relative to exact depth.
     lsd = 1 / (2 * noise**2 + slope_of_image**2 * variance)
     torch.testing.assert_close(weight, lsd / (1 / (2 * noise**2)))
     (derivative,) = torch.autograd.grad((0.5 * weight.log()).sum(), slope_of_image)

@@ -1,4 +1,4 @@
-"""The contract of a central camera: one kernel serves whatever fulfils it (equations.md, sections 1 to 3).
+"""The contract of a central camera: one kernel serves whatever fulfils it (mathematics.md, sections 1 to 3).
 
 Pixels are continuous with the image's outer corner as origin and centres at +0.5. The camera frame has x right, y down,
 z forward. A ray is a point with range 1 in the camera's own measure: `scale(ray) == 1`.
@@ -127,7 +127,7 @@ class Camera(ABC):
         """Return which points with pixels uv lie in view and `margin` pixels inside the image; None when all do."""
 
     def covector(self, ray: Float[Tensor, "*batch 3"], g_uv: Float[Tensor, "*batch 2"]) -> Float[Tensor, "*batch 3"]:
-        """Return the image gradient as G on the ray: `dI = G . d(ray)` with `G . ray == 0` (equations.md, section 3).
+        """Return the image gradient as G on the ray: `dI = G . d(ray)` with `G . ray == 0` (mathematics.md, section 3).
 
         Args:
             ray: Rays of this camera.

@@ -1,4 +1,4 @@
-"""The sphere: longitude and latitude as pixels (equations.md, section 2; Huang and Yeung's 360VO, section 7)."""
+"""The sphere: longitude and latitude as pixels (mathematics.md, section 2; Huang and Yeung's 360VO, section 7)."""
 
 import math
 from dataclasses import dataclass

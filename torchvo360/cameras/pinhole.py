@@ -1,4 +1,4 @@
-"""The pinhole: a plane at z = 1 (equations.md, section 2)."""
+"""The pinhole: a plane at z = 1 (mathematics.md, section 2)."""
 
 from dataclasses import dataclass
 from typing import Self

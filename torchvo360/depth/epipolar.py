@@ -2,9 +2,9 @@
 
 The match of a reference ray r1 in the target lies on the great circle from R r1 (a point at infinity) to t (a point at
 the camera), at the angle theta with tan(theta) = rho |t| sin(phi) / (1 + rho |t| cos(phi)), where phi is the angle
-between the two ends (equations.md, section 5). The search runs in steps of one pixel of arc around the predicted angle,
-compares five samples spaced along the curve, refines the best by a parabola, and says how sure the result is (LSD-SLAM,
-Engel et al. 2013: geometric and photometric error of a disparity).
+between the two ends (mathematics.md, section 5). The search runs in steps of one pixel of arc around the predicted
+angle, compares five samples spaced along the curve, refines the best by a parabola, and says how sure the result is
+(LSD-SLAM, Engel et al. 2013: geometric and photometric error of a disparity).
 """
 
 from dataclasses import dataclass

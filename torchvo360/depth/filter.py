@@ -1,4 +1,4 @@
-"""The inverse-range filter: each point's rho is a Gaussian, fused with every match (equations.md, section 5).
+"""The inverse-range filter: each point's rho is a Gaussian, fused with every match (mathematics.md, section 5).
 
 Inverse ranges are pooled by 1 / V: weights of rho^2 / V favour near points and shrink the scale fivefold over a minute
 (measured on real video).

@@ -1,4 +1,4 @@
-"""The image gradient as a covector field on the rays (equations.md, section 3)."""
+"""The image gradient as a covector field on the rays (mathematics.md, section 3)."""
 
 import torch
 from jaxtyping import Float

@@ -1,4 +1,4 @@
-"""Image pyramids: each level is half as large, so that a pixel at uv lies at uv / 2 (equations.md, section 1)."""
+"""Image pyramids: each level is half as large, so that a pixel at uv lies at uv / 2 (mathematics.md, section 1)."""
 
 from collections.abc import Sequence
 

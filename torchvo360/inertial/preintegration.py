@@ -1,7 +1,7 @@
 """IMU preintegration: the motion between two times from the samples between them, before pose and velocity are known.
 
 Between samples the rates and forces are taken as linear in time, so a segment may begin and end anywhere. Within an
-interval of dt seconds they are those of its middle, the force in the axes of half the interval's turn (equations.md,
+interval of dt seconds they are those of its middle, the force in the axes of half the interval's turn (mathematics.md,
 section 8, with the accelerations turned by that half):
 
     dp <- dp + dv dt + dR Exp(w dt / 2) a dt^2 / 2,   dv <- dv + dR Exp(w dt / 2) a dt,   dR <- dR Exp(w dt)

@@ -1,6 +1,6 @@
 """Convolution and enlargement on the sphere: panoramas continue around the seam and over the poles.
 
-A map's pixel is the centre of the pixels that it came from, as in image pyramids (equations.md, section 1): a stride
+A map's pixel is the centre of the pixels that it came from, as in image pyramids (mathematics.md, section 1): a stride
 takes an even kernel, so that no level is shifted against the images by half a pixel.
 """
 

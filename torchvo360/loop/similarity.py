@@ -4,7 +4,7 @@
 
 Four kinds of rows, each over its own standard deviation, with one brightness (a, b) for either direction:
 
-    photometric, A into B    the pose of equations.md, section 3, is (R, t / s), in A's scale
+    photometric, A into B    the pose of mathematics.md, section 3, is (R, t / s), in A's scale
     photometric, B into A    likewise (R^T, -R^T t), in B's scale, with xi carried over by -Ad(S_a_b)
     range, A against B       e = log rho_b' - log rho_b: a point of A, moved into B, beside B's nearest point
     range, B against A       likewise

@@ -53,7 +53,7 @@ def inverse_ranges(
     ref: Float[Tensor, "N 3"],
     tgt: Float[Tensor, "N 3"],
 ) -> Float[Tensor, "*batch N"]:
-    """Return rho of each reference bearing from its match, in least squares (equations.md, section 5)."""
+    """Return rho of each reference bearing from its match, in least squares (mathematics.md, section 5)."""
     turned = ref @ R.mT
     n = torch.linalg.cross(tgt.expand_as(turned), t[..., None, :].expand_as(turned))
     return -(n * torch.linalg.cross(tgt.expand_as(turned), turned)).sum(-1) / n.square().sum(-1).clamp_min(1e-12)

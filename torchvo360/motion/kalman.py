@@ -5,7 +5,7 @@ A state is a Gaussian over `x` [*batch, D], float64. One step is
     predict:  mean = A mean,            covariance = A P A^T + Q
     update:   S = C P C^T + R,  K = P C^T S^-1,  mean += K (z - C mean),  P = (I - K C) P (I - K C)^T + K R K^T
 
-(equations.md, section 9). The only Python loop is the smoother's, over time.
+(mathematics.md, section 9). The only Python loop is the smoother's, over time.
 """
 
 from dataclasses import dataclass
@@ -182,7 +182,7 @@ def constant_velocity(
         A and Q of the state (x1, x1', x2, x2', ...): per axis [[1, T], [0, 1]] and
         k^2 [[T^4/4, T^3/2], [T^3/2, T^2]]. Q depends on how time is cut into steps.
 
-    Source: equations.md, section 9.
+    Source: mathematics.md, section 9.
     """
     check_shape("acceleration", acceleration, "axes")
     one, zero = torch.ones_like(dt_s), torch.zeros_like(dt_s)

@@ -3,7 +3,7 @@
 Open cells lie in a binary heap by f = g + h, then h, then their number, which is a total order: every backend takes
 them in the same one. A cell is closed when it leaves the heap; a cheaper way to a closed cell opens it again, which an
 inconsistent bound needs. The search ends when the goal leaves the heap, not when it enters, and fails only when the
-heap is empty: a dead end is no end (equations.md, sections 9 and 10).
+heap is empty: a dead end is no end (mathematics.md, section 9).
 
 A step costs its length times the mean weight of its two cells. Weights are at least 1, so that the octile distance is a
 lower bound, and a consistent one. A diagonal step needs both cells beside it: no corner is cut.

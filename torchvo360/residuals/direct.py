@@ -2,7 +2,7 @@
 
     r = I_tgt(project(R r_ref + rho t)) - (e^a I_ref + b)
 
-in the tangent form of equations.md, section 3: with the point's ray r2 and inverse range rho2 in the target and the
+in the tangent form of mathematics.md, section 3: with the point's ray r2 and inverse range rho2 in the target and the
 image gradient as a covector G on that ray, the Jacobian's row by (v, w, a, b) is [rho2 G, r2 x G, -e^a I_ref, -1].
 """
 
@@ -153,7 +153,7 @@ class Samples(NamedTuple):
     rho: Tensor
     """Inverse range in the target."""
     inv_scale: Tensor
-    """1 / s of equations.md, section 3."""
+    """1 / s of mathematics.md, section 3."""
     G: tuple[Tensor, Tensor, Tensor]
     """Components of the target's gradient as a covector."""
     gained: Tensor
@@ -237,7 +237,7 @@ def by_intrinsics(
 ) -> Float[Tensor, "B 4 M"]:
     """Return the derivative of the residual by the intrinsics k = (fx, fy, cx, cy); M = C N.
 
-        dI/dk = (g_u a_u, g_v a_v, g_u, g_v) + G . d(R r1)/dk / s          (equations.md, section 3)
+        dI/dk = (g_u a_u, g_v a_v, g_u, g_v) + G . d(R r1)/dk / s          (mathematics.md, section 3)
 
     The first part is the target's projection at a fixed point, the second the host's ray, which turns when its pixel
     stays: with one k for both images the two nearly cancel. The inverse range and the host's value are held.

@@ -75,9 +75,9 @@ def depth_variance_weight(
 ) -> tuple[Float[Tensor, "*batch"], Float[Tensor, "*batch"]]:
     """Return W = `2 s^2 / (2 s^2 + (dI/drho)^2 V)` and its logarithmic slope `-d ln(sqrt W) / d(dI/drho)`.
 
-    W is LSD-SLAM's weight (equations.md, section 5) relative to exact depth. The slope is needed because dI/drho grows
-    with the translation: with W held constant in a Gauss-Newton step, noise in rho shrinks every translation a little,
-    and the scale drifts. With it the normalised residual is minimised as it is, which is total least squares.
+    W is LSD-SLAM's weight (mathematics.md, section 5) relative to exact depth. The slope is needed because dI/drho
+    grows with the translation: with W held constant in a Gauss-Newton step, noise in rho shrinks every translation a
+    little, and the scale drifts. With it the normalised residual is minimised as it is, which is total least squares.
 
     Args:
         dI_drho: Derivative of the residual by the inverse range.

@@ -11,7 +11,7 @@ class LMConfig:
 
     max_steps: int = 30
     damping: str = "gain_ratio"
-    """gain_ratio: Nielsen's rule, by how well the model predicted the cost; lsd: LSD-SLAM's (equations.md, 7)."""
+    """gain_ratio: Nielsen's rule, by how well the model predicted the cost; lsd: LSD-SLAM's (mathematics.md, 7)."""
     initial_damping: float = 1e-3
     """Lambda at the start, relative to the diagonal of H; the lsd schedule starts from 0."""
     max_damping: float = 1e5

@@ -13,7 +13,7 @@ PIVOT_TOLERANCE = 1e-12
 def solve_ldl(
     A: Float[Tensor, "*batch D D"], b: Float[Tensor, "*batch D"]
 ) -> tuple[Float[Tensor, "*batch D"], Bool[Tensor, "*batch"]]:
-    """Solve `A x = b` for symmetric positive definite A by LDL^T (equations.md, section 7).
+    """Solve `A x = b` for symmetric positive definite A by LDL^T (mathematics.md, section 7).
 
     The matrix is first scaled to a unit diagonal, so that parameters of different units weigh alike. The signs and
     sizes of D tell whether it is positive definite. Gradients of any order reach A and b, under `torch.func.vmap` too;

@@ -98,7 +98,7 @@ def choose(mask: Bool[Tensor, "A"], new: tuple[Tensor, ...], old: tuple[Tensor, 
 def damped_step(
     equations: NormalEquations, damping: Float[Tensor, "A"], free: Bool[Tensor, "D"]
 ) -> tuple[Float[Tensor, "A D D"], Float[Tensor, "A D"], Float[Tensor, "A D"], Bool[Tensor, "A"]]:
-    """Return H and g per unit of weight, the step, and whether the damped H is positive definite (equations.md, 7)."""
+    """Return H and g per unit of weight, the step, and whether the damped H is positive definite (mathematics.md 7)."""
     weight = equations.weight[:, None]
     fixed = torch.diag((~free).to(equations.H.dtype))
     H = equations.H / weight[..., None] * (free[:, None] & free) + fixed

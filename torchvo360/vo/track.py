@@ -146,7 +146,7 @@ def track(
 
 
 def _covariance(equations: NormalEquations, element: int) -> Float64[Tensor, "6 6"]:
-    """Return the pose's covariance, s^2 H^-1 with the brightness eliminated (equations.md, section 7)."""
+    """Return the pose's covariance, s^2 H^-1 with the brightness eliminated (mathematics.md, section 7)."""
     inverse, ok = inverse_ldl(equations.H[element])
     variance = equations.square[element] / (equations.weight[element] - 8).clamp_min(1)
     return torch.where(ok, inverse[:6, :6] * variance, torch.inf)

@@ -38,7 +38,7 @@ class WindowConfig:
     min_threshold: float = 60 / 255**2
     """Least outlier threshold."""
     stereo_coupling: float = 1.0
-    """Weight lambda of the static stereo residuals (equations.md, section 6)."""
+    """Weight lambda of the static stereo residuals (mathematics.md, section 6)."""
     calibrate: bool = False
     """Estimate the intrinsics fx, fy, cx, cy with the poses; of a panorama fy and cy, the others being held. The given
     ones may be off by a few percent. It takes about twice the time, and not a rig."""

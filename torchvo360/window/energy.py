@@ -1,6 +1,6 @@
 """The window's photometric energy, and its normal equations.
 
-Each point is compared, through its pattern, with every keyframe but its host (equations.md, section 6):
+Each point is compared, through its pattern, with every keyframe but its host (mathematics.md, section 6):
 
     r = I_j(project(R_j (R_i^T ray + rho c_i) + rho t_j)) - b_j - e^(a_j - a_i) (I_i - b_i)
 

@@ -1,4 +1,4 @@
-"""Static stereo (equations.md, section 6): each point seen by its own host's further cameras, at the same moment.
+"""Static stereo (mathematics.md, section 6): each point seen by its own host's further cameras, at the same moment.
 
     r = I_other(project(R ray + rho t)) - (e^a I_host + b),      T_other_host = (R, t) known and fixed
 

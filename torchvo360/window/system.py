@@ -43,7 +43,7 @@ class WindowSystem(NamedTuple):
 def columns(estimate: Estimate, T_cam_world: Float64[Tensor, "K 4 4"]) -> Float64[Tensor, "K K L D"]:
     """Return d(local unknowns of the edge i -> j) / d(all unknowns): I at j, -Ad(T_ji) at i, I at the intrinsics.
 
-    The local ones are (v, w, a, b) of the target with the host at rest, and the intrinsics (equations.md, section 6).
+    The local ones are (v, w, a, b) of the target with the host at rest, and the intrinsics (mathematics.md, section 6).
     """
     K = T_cam_world.shape[0]
     T_j_i = T_cam_world[None] @ lie.se3_inverse(T_cam_world)[:, None]

@@ -1,7 +1,7 @@
 """Tracing: from no idea of a new point's range to a start for its optimisation, all points at once.
 
 The points of a new keyframe are traced backwards into the last ones, which makes them usable at once. Along each
-point's great circle (equations.md, section 5) every pixel of arc is compared by five samples spaced along the curve,
+point's great circle (mathematics.md, section 5) every pixel of arc is compared by five samples spaced along the curve,
 which takes one look-up a pixel; the best few places are then compared through the whole pattern, in all views.
 """
 

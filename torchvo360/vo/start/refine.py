@@ -1,7 +1,7 @@
 """Joint photometric refinement of a start: poses, brightness and inverse ranges together, by a Schur complement.
 
 One host frame, K target frames, N points, each seen through a pattern of 8 pixels. Each residual depends on one frame's
-(pose, a, b) and one point's rho; the inverse ranges are eliminated, because their block is diagonal (equations.md,
+(pose, a, b) and one point's rho; the inverse ranges are eliminated, because their block is diagonal (mathematics.md,
 section 6). The unit is held by the length of the last frame's translation: with the scale free, two-frame refinement
 accepts no step (measured).
 """

@@ -13,7 +13,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from torchvo360 import lie
-from torchvo360.backends import eager, linearize
+from torchvo360.backends import eager, linearize, numba
 from torchvo360.cameras import Camera, Equirectangular, Pinhole
 from torchvo360.image import pad_image
 from torchvo360.residuals.direct import Reference, Target, by_rho, look_up, make_target
@@ -24,6 +24,7 @@ PLANE = Pinhole(96, 72, 80.0, 84.0, 47.1, 36.4)
 CAMERAS = pytest.mark.parametrize("camera", [SPHERE, PLANE], ids=["sphere", "pinhole"])
 CHANNELS = pytest.mark.parametrize("channels", [1, 3])
 HUBER = LossConfig(scale=0.05)
+BACKENDS = pytest.mark.parametrize("backend", [eager, numba], ids=["eager", "numba"])
 
 
 def texture(camera: Camera, *batch: int, seed: int = 0) -> Float[Tensor, "*batch H W"]:
@@ -167,13 +168,16 @@ def test_float64_equals_the_textbook(camera, channels, loss):
     torch.testing.assert_close(found.weight[0], weight, rtol=1e-12, atol=0)
 
 
+@BACKENDS
 @CAMERAS
 @CHANNELS
 @pytest.mark.parametrize("variance", [False, True], ids=["exact depth", "uncertain depth"])
-def test_float32_equals_float64_truth(camera, channels, variance):
+def test_float32_equals_float64_truth(backend, camera, channels, variance):
+    if backend is numba:
+        pytest.importorskip("numba")
     reference, target, T, affine = problem(camera, 4, channels, variance=variance)
     reference = off_cell_borders(camera, reference, T)
-    found = linearize(reference, target, T, affine, HUBER)
+    found = backend.linearize(reference, target, T, affine, HUBER)
     truth = linearize(*in_float64(reference, target), T.float().double(), affine.float().double(), HUBER)
     for k in range(4):
         assert relative(found.H[k], truth.H[k]) < 1e-6

@@ -7,8 +7,7 @@ import csv
 import json
 import os
 import signal
-import subprocess
-import sys
+import threading
 import time
 from pathlib import Path
 
@@ -20,6 +19,7 @@ import yaml
 
 from torchvo360.checks import InputError
 from torchvo360.cli.bench import main
+from torchvo360.cli.benchmark.report import table_of_sequences
 from torchvo360.cli.benchmark.suite import find_sequences
 from torchvo360.cli.command import conf_folder
 from torchvo360.cli.configuration import compose
@@ -108,7 +108,7 @@ def test_a_real_run_and_one_that_kills_its_own_process_stand_in_one_table(tmp_pa
     Path("deadly.py").write_text(killer + "        os.kill(os.getpid(), signal.SIGKILL)\n")
     monkeypatch.setenv("PYTHONPATH", os.pathsep.join([str(tmp_path), str(conf_folder().parent)]))
     entries = [{"name": "killed", "depth": {"_target_": "deadly.Net"}}, {"name": "fine", "vo": "clean"}]
-    settings = {"input": "synthetic", "synthetic": TINY, "plot": False}
+    settings = {"input": "synthetic", "synthetic": TINY, "plot": False, "report": False}
     Path("mine.yaml").write_text(yaml.safe_dump({"settings": settings, "sequences": entries}))
     assert main(["dataset=mine.yaml", "seeds=[3]", "out=b"]) == 1
     rows = rows_of("b")
@@ -124,29 +124,38 @@ def test_a_real_run_and_one_that_kills_its_own_process_stand_in_one_table(tmp_pa
 
 @pytest.mark.usefixtures("stub")
 def test_what_fails_is_told_and_done_again_and_what_is_finished_is_kept(capsys):
-    dataset = write_list("good", "refused", "dies", "crashes")
-    assert main([dataset, "seeds=2", "out=b"]) == 1
-    assert len(calls()) == 8
+    names = ("good", "refused", "dies", "crashes")
+    dataset = write_list(*names)
+    assert main([dataset, "out=b"]) == 1
+    assert len(calls()) == 4
     rows = rows_of("b")
-    problems = {name: rows[f"{name} default 1"]["problem"] for name in ("good", "refused", "dies", "crashes")}
+    problems = {name: rows[f"{name} default 0"]["problem"] for name in names}
     assert problems == {
         "good": "",
         "refused": "input: expected a video, got none.",
         "dies": "killed by SIGKILL, as for want of memory",
         "crashes": "ValueError: of its own",
     }
-    assert "| refused | default | 0/2 |" in Path("b/table.md").read_text()
-    assert "seed 0: input: expected a video, got none.; seed 1:" in Path("b/table.md").read_text()
+    assert "| refused | default | 0/1 |" in Path("b/table.md").read_text()
+    assert "seed 0: input: expected a video, got none." in Path("b/table.md").read_text()
     Path("cured").touch()
     capsys.readouterr()
     assert main([dataset, "seeds=2", "out=b"]) == 0
-    assert sorted(calls()) == sorted(f"{name}.mp4 {seed}" for name in ("refused", "dies", "crashes") for seed in (0, 1))
+    missing = [*(f"{name}.mp4 0" for name in names[1:]), *(f"{name}.mp4 1" for name in names)]
+    assert sorted(calls()) == sorted(missing)
     said = capsys.readouterr()
-    assert said.out.startswith("2 of 8 runs are finished already.")
+    assert said.out.startswith("1 of 8 runs are finished already.")
     assert said.err == ""
     assert {row["ending"] for row in rows_of("b").values()} == {"finished", ""}
-    assert main([dataset, "seeds=3", "out=b"]) == 0
-    assert calls() == [f"{name}.mp4 2" for name in ("good", "refused", "dies", "crashes")]
+
+
+def test_a_line_of_the_table_holds_the_problems_of_all_its_seeds():
+    rows = [
+        {"sequence": "a", "preset": "fast", "seed": seed, "ending": "failed", "problem": f"no. {seed}"}
+        for seed in (0, 1)
+    ]
+    text = table_of_sequences(rows, problems=True).as_markdown()
+    assert "| a | fast | 0/2 | seed 0: no. 0; seed 1: no. 1 |" in text
 
 
 @pytest.mark.usefixtures("stub")
@@ -207,16 +216,19 @@ def test_a_folder_with_other_settings_is_not_mixed_up(capsys):
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
 def test_a_stopped_benchmark_keeps_what_is_finished(number):
     dataset = write_list("good", "waits", "other")
-    # -P: the stub in the current folder is for the jobs alone
-    code = f"import sys; from torchvo360.cli.bench import main; sys.exit(main([{dataset!r}, 'out=b']))"
-    environment = {**os.environ, "PYTHONPATH": str(conf_folder().parent)}
-    command = [sys.executable, "-P", "-c", code]
-    with subprocess.Popen(command, stdout=subprocess.DEVNULL, env=environment) as process:
-        deadline = time.monotonic() + 60
+
+    def stop_it() -> None:
+        deadline = time.monotonic() + 30
         while not Path("waiting").exists() and time.monotonic() < deadline:
             time.sleep(0.05)
-        process.send_signal(number)
-        assert process.wait(30) == 128 + number
+        os.kill(os.getpid(), number)
+
+    thread = threading.Thread(target=stop_it)
+    thread.start()
+    try:
+        assert main([dataset, "out=b"]) == 128 + number
+    finally:
+        thread.join()
     rows = rows_of("b")
     assert [rows[f"{name} default 0"]["ending"] for name in ("good", "waits", "other")] == [
         "finished",
@@ -233,9 +245,9 @@ def test_a_stopped_benchmark_keeps_what_is_finished(number):
 def test_a_workers_death_does_not_end_the_benchmark(capsys):
     pytest.importorskip("hydra_plugins.hydra_joblib_launcher", reason="the launcher joblib is not installed")
     launcher = ["cluster=joblib", "hydra.launcher.n_jobs=2"]
-    assert main([write_list("good", "deadly", "other"), "out=b", *launcher]) == 0
+    assert main([write_list("deadly", "good"), "out=b", *launcher]) == 0
     assert "the launcher failed: TerminatedWorkerError" in capsys.readouterr().err
-    assert len(list(Path("b").glob("*/default/seed_0/summary.json"))) == 3
+    assert len(list(Path("b").glob("*/default/seed_0/summary.json"))) == 2
 
 
 @pytest.mark.parametrize(
@@ -247,13 +259,13 @@ def test_a_workers_death_does_not_end_the_benchmark(capsys):
         (["seeds=[1,1]"], "seeds: expected their number or a list of different ones, got [1, 1]"),
         (["seeds=many"], "seeds: expected their number or a list"),
         (["presets=[fast,fast]"], "presets: expected one or a list of different ones"),
-        (["presets=hasty"], "vo: expected one of"),
+        (["presets=hasty", "dataset=one.yaml"], "vo: expected one of"),
         (["align=sim2"], "align: expected one of sim3, se3, none, got 'sim2'"),
         (["seed=3"], "seed: expected seeds in its place for a benchmark, got seed=3"),
         (["vo=fast"], "vo: expected presets in its place"),
         (["input=walk.mp4"], "input: expected dataset in its place"),
         (["synthetic.widht=64"], "synthetic.widht: expected a known key such as synthetic.width"),
-        (["synthetic.width=100"], "synthetic.width: expected twice the height"),
+        (["synthetic.width=100", "dataset=one.yaml"], "synthetic.width: expected twice the height"),
         (["fast"], "fast: expected key=value, such as dataset=synthetic, or --help"),
         (["out="], "out: expected a folder, got an empty name"),
         (["out=file"], "out: expected a folder that can be written"),
@@ -262,11 +274,12 @@ def test_a_workers_death_does_not_end_the_benchmark(capsys):
 def test_a_mistake_in_the_call_is_one_sentence_and_nothing_is_left(words, complaint, capsys):
     Path("empty").mkdir()
     Path("file").touch()
+    Path("one.yaml").write_text("[{name: one, input: synthetic}]")
     assert main([*words, "out=b"] if not words[0].startswith("out") else words) == 2
     said = capsys.readouterr().err
     assert said.startswith(f"torchvo360-bench: {complaint}")
     assert said.count("\n") == 1
-    assert sorted(path.name for path in Path().iterdir()) == ["empty", "file"]
+    assert sorted(path.name for path in Path().iterdir()) == ["empty", "file", "one.yaml"]
 
 
 def test_an_unknown_or_absent_launcher_is_named(capsys):

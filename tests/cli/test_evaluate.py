@@ -154,6 +154,8 @@ def test_what_cannot_be_evaluated_does_not_keep_the_others_from_it(capsys):
             "runs/a/trajectory.txt: expected truth=FILE, as it has no true poses of its own, got none",
         ),
         (["runs/a", "gone.txt"], "truth: gone.txt: expected a trajectory file, got No such file"),
+        (["runs/a", "truth="], "truth: expected a TUM file, got an empty name"),
+        (["~nobody_of_this_name/a"], "expected a known user's folder, got ~nobody_of_this_name/a"),
         (["gone", "truth=truth.txt"], "gone: expected a trajectory file, got No such file"),
         (["runs/a", "runs/b", *["truth=truth.txt"] * 3], "truth: expected one for all or 2, one for each, got 3"),
         (["runs/a", "truth.txt", "out=t.xls"], "out: expected a name that ends with .csv, .md, .tex"),
@@ -195,6 +197,24 @@ def test_a_run_whose_own_truth_is_out_of_reach_says_why(settings, complaint, cap
         Path("run/config.yaml").write_text(settings if isinstance(settings, str) else yaml.safe_dump(settings))
     assert main(["run"]) == 2
     assert capsys.readouterr().err.startswith(f"torchvo360-eval: {complaint}")
+
+
+@pytest.mark.usefixtures("runs")
+def test_a_table_that_cannot_be_written_keeps_neither_the_others_nor_the_complaints_back(capsys):
+    assert main(["runs/a", "gone", "truth=truth.txt", "out=none/t.csv", "out=t.md", "frames=999"]) == 2
+    assert Path("t.md").is_file()
+    said = capsys.readouterr()
+    assert "RPE over 39 poses" in said.out  # as many as there are
+    assert [line.split(": ")[1] for line in said.err.splitlines()] == ["gone", "t.csv"]
+
+
+@pytest.mark.usefixtures("runs")
+def test_a_reader_that_goes_away_is_no_defect():
+    command = [sys.executable, "-m", "torchvo360.cli.evaluate", "runs/a", "truth.txt"]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
+        process.stdout.close()
+        assert process.stderr.read() == ""
+    assert process.returncode == 141
 
 
 @pytest.mark.usefixtures("runs")

@@ -128,6 +128,16 @@ def test_a_way_on_a_map_that_is_there(drawn, tmp_path, capsys):
     assert (drawn.read_bytes(), drawn.with_name("map.pgm").read_bytes()) == before
 
 
+def test_on_a_map_in_another_unit_the_robots_size_has_to_be_said(tmp_path, capsys):
+    path = write_map(tmp_path, OccupancyMap(torch.full((20, 20), FREE, dtype=torch.int8), 0.1), unit="units")
+    arguments = [f"map={path}", "start=0.5,0.5", "goal=1.5,0.5", "plot=false", "margin=0"]
+    assert main(arguments) == 2
+    assert "robot_radius: expected a length in the map's unit" in capsys.readouterr().err
+    assert main([*arguments, "robot_radius=0.1"]) == 0
+    assert "way: 1 units from (0.5, 0.5) to (1.5, 0.5), 2 corners, without any obstacle" in capsys.readouterr().out
+    assert json.loads((tmp_path / "plan" / "plan.json").read_text())["clearance"] is None
+
+
 def test_no_way_is_told_by_its_own_exit_code_and_leaves_no_old_way(drawn, tmp_path, capsys):
     arguments = [f"map={drawn}", "start=1,1", "plot=false"]
     assert main([*arguments, "goal=5,1"]) == 0

@@ -65,8 +65,11 @@ ALL = [command for page in PAGES if page.exists() for command in commands(page)]
 
 
 def of(*programs: str) -> list:
-    chosen = [command for command in ALL if command.words[0] in programs]
-    return [pytest.param(command.words, id=f"{command.page}: {' '.join(command.words)}") for command in chosen]
+    chosen: dict[str, Command] = {}  # once, however many pages have it
+    for command in ALL:
+        if command.words[0] in programs:
+            chosen.setdefault(shlex.join(command.words), command)
+    return [pytest.param(command.words, id=f"{command.page}: {' '.join(command.words)}") for command in chosen.values()]
 
 
 @pytest.fixture

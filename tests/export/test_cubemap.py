@@ -148,7 +148,7 @@ def test_what_a_partial_panorama_does_not_see_is_black_and_masked():
         ({"faces": 5}, "faces: expected 4 or 6, got 5"),
         ({"fov_deg": 80.0}, "fov: expected a finite number above 90 at most 120, got 80"),
         ({"fov_deg": 170.0}, "fov: expected a finite number above 90 at most 120, got 170"),
-        ({"size": 4}, "size: expected an integer of at least 8, got 4"),
+        ({"size": 4}, "size: expected an integer from 8 to 8192, got 4"),
     ],
 )
 def test_settings_that_make_no_cube_are_refused(settings, message):

@@ -158,16 +158,17 @@ def test_a_mask_and_a_smaller_size_of_the_run_hold_for_the_export(journey):
 
 
 def test_a_video_becomes_a_posed_data_set_in_one_command(capsys):
-    arguments = ["input=theta_walk", "stop=24", "plot=false", "out=data", "frames=4", "fov=95"]
+    (Path("colmap") / "file").mkdir(parents=True)  # not in the way: without `out` the run's folder is the place
+    arguments = ["input=theta_walk", "stop=24", "plot=false", "report=false", "frames=4", "fov=95"]
     assert main(arguments) == 0
     (run,) = Path("runs/theta_walk").iterdir()
     assert (run / "summary.json").is_file()
-    assert {path.name for path in Path("data/sparse/0").iterdir()} == set(COLMAP)
+    assert {path.name for path in (run / "colmap/sparse/0").iterdir()} == set(COLMAP)
     out = capsys.readouterr().out
     assert f"results: {run}" in out
     assert "faces down" in out  # the operator's mask
     pycolmap = pytest.importorskip("pycolmap")
-    model = pycolmap.Reconstruction("data/sparse/0")
+    model = pycolmap.Reconstruction(run / "colmap/sparse/0")
     off = [
         np.linalg.norm(image.project_point(model.points3D[point.point3D_id].xyz) - point.xy)
         for image in model.images.values()
@@ -188,6 +189,14 @@ def test_a_video_becomes_a_posed_data_set_in_one_command(capsys):
         (["run=run", "frames=0"], "frames: expected keyframes or a number such as 10, got 0."),
         (["run=run", "frames=some"], "frames: expected keyframes or a number such as 10, got some."),
         (["run=run", "faces=5"], "faces: expected 4 or 6, got 5."),
+        (["run=run", "size=10000000"], "size: expected an integer from 8 to 8192, got 10000000."),
+        (["run=run", "out="], "out: expected a name, got an empty one."),
+        (["run=~nobody_of_this_name/run"], "run: expected a known user's folder, got ~nobody_of_this_name/run."),
+        (["input=synthetic", "faces=5"], "faces: expected 4 or 6, got 5."),
+        (
+            ["input=synthetic", "out=run/map.ply/data"],
+            "out: expected a place that can be written, got run/map.ply/data",
+        ),
         (["run=run", "faces=many"], "faces: expected an integer, got many."),
         (["run=run", "fov=20"], "fov: expected a finite number above 90 at most 120, got 20"),
         (["run=run", "image=gif"], "image: expected one of jpg, png, got 'gif'."),
@@ -218,6 +227,13 @@ def test_mistakes_are_told_in_one_sentence_and_nothing_is_written(run_folder, ca
         ("frames.csv", "index,time,state\n", "run: expected frames in run/frames.csv, got none."),
         ("frames.csv", "a,b\n1,2\n", "run: expected frames as torchvo360 writes them"),
         ("frames.csv", None, "run: expected run/frames.csv, got No such file"),
+        ("frames.csv", "index,time,state\n0,inf,tracking\n", "run: expected frames as torchvo360 writes them"),
+        ("frames.csv", f"index,time,state\n{10**30},0,tracking\n", "run: expected frames as torchvo360 writes them"),
+        ("frames.csv", "index,time,state\n0,0,flying\n", "run: expected frames as torchvo360 writes them"),
+        ("frames.csv", "index,time,state\n0,0,tracking\n", "got 18 poses in trajectory.txt at times of no frame in"),
+        ("summary.json", '{"width": Infinity, "height": 1}', "run: expected a summary.json that torchvo360 wrote"),
+        ("summary.json", '{"width": 2, "height": 1, "gravity": [1]}', "run: expected a summary.json that torchvo360"),
+        ("config.yaml", "", "run: expected settings as torchvo360 writes them in run/config.yaml, got: no input."),
         ("config.yaml", None, "run: expected run/config.yaml, got No such file"),
         ("config.yaml", "input: [", "run: expected settings as torchvo360 writes them in run/config.yaml, got: "),
         ("config.yaml", "start: many", "run: expected settings as torchvo360 writes them in run/config.yaml, got: "),
@@ -229,6 +245,19 @@ def test_a_damaged_run_is_told_in_one_sentence(run_folder, capsys, file, text, m
     before = content(Path())
     assert message in refused(capsys, "run=run", "out=data")
     assert content(Path()) == before
+
+
+def test_points_that_are_not_finite_are_refused(run_folder, capsys):
+    path = run_folder / "map.ply"
+    path.write_bytes(path.read_bytes()[:-19] + np.full(3, np.nan, np.float32).tobytes() + bytes(7))
+    assert "map.ply: expected finite coordinates, got others" in refused(capsys, "run=run", "out=data")
+
+
+def test_a_mask_that_hides_all_faces_is_told(journey, capsys):
+    write_run(Path("run"), journey[1], {"input": str(journey[0]), "mask": "above:-70"})
+    message = "faces: expected some of which the mask leaves more than 2 %, got none."
+    assert message in refused(capsys, "run=run", "out=data", "faces=4")
+    assert not Path("data").exists()
 
 
 def test_an_input_that_has_changed_is_refused(run_folder, journey, capsys):

@@ -212,6 +212,7 @@ def test_rays_that_are_not_finite_are_left_out():
         ({"step": 2.0}, "step"),
         ({"carrier_radius": math.inf}, "carrier_radius"),
         ({"layer": 0.0}, "layer"),
+        ({"resolution": 3.0, "max_range": 2.0}, "max_range"),
     ],
 )
 def test_settings_that_make_no_sense_are_refused(settings, told):
@@ -227,7 +228,7 @@ def test_a_map_without_a_path_or_with_too_many_cells_is_refused():
         build_map(rays, PATH[0])
     with pytest.raises(InputError, match=r"^resolution: expected at least"):
         build_map(rays, PATH, MapConfig(resolution=1e-5))
-    with pytest.raises(InputError, match=r"^layer: expected at least"):
+    with pytest.raises(InputError, match=r"^robot_height: expected at most .* layers of 1e-05 on "):
         build_map(rays, PATH, MapConfig(resolution=0.01, layer=1e-5))
 
 

@@ -55,6 +55,21 @@ def test_an_empty_hall_is_crossed_in_a_straight_line():
     assert plan.length == pytest.approx(math.hypot(4.87, 2.69))
 
 
+def test_a_robot_larger_than_a_map_without_obstacles_may_stand_anywhere_on_it():
+    cell = mapped(hall(1, 1)[0])
+    plan = plan_path(cell, (0.03, 0.03), (0.07, 0.03), PlanConfig(robot_radius=5.0))
+    assert plan.found
+    assert plan.clearance == math.inf
+    blocked = PlanConfig(robot_radius=5.0, unknown="blocked")  # what lies outside is not known
+    assert plan_path(cell, (0.03, 0.03), (0.07, 0.03), blocked).reason == Reason.TIGHT
+
+
+@pytest.mark.parametrize("margin", [1e-320, 1e-40, 1e6])
+def test_a_margin_of_any_size_leaves_weights_that_are_numbers(margin):
+    weight = clearance_of(with_wall(), PlanConfig(robot_radius=0.25, margin=margin)).weight
+    assert (weight >= 1).all()
+
+
 @pytest.mark.parametrize("smooth", [True, False])
 def test_a_robot_keeps_its_radius_from_every_obstacle(smooth):
     map = with_wall()

@@ -13,6 +13,7 @@ import threading
 from collections.abc import Sequence
 from importlib import metadata
 from pathlib import Path
+from types import ModuleType
 
 ENVIRONMENT = {
     # What OpenCV would say of a damaged file is said by us, in one sentence.
@@ -43,7 +44,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     for name, value in ENVIRONMENT.items():
         os.environ.setdefault(name, value)
     try:
-        _import_libraries()
+        import_undisturbed("torchvo360.cli.jobs")
         return _main(arguments.overrides, arguments.multirun, arguments.cfg)
     except KeyboardInterrupt:
         print("torchvo360: interrupted.", file=sys.stderr)
@@ -56,22 +57,23 @@ def conf_folder() -> Path:
     return package / "conf" if (package / "conf").is_dir() else package.parent / "conf"
 
 
-def _import_libraries() -> None:
-    """Import the heavy libraries with Ctrl-C held back: it would leave them half imported, and be swallowed by some.
+def import_undisturbed(module: str) -> ModuleType:
+    """Import a module with Ctrl-C held back: it would leave heavy libraries half imported, and be swallowed by some.
 
     Raises:
         KeyboardInterrupt: Ctrl-C came meanwhile.
     """
     if threading.current_thread() is not threading.main_thread():
-        return
+        return importlib.import_module(module)
     came = []
     before = signal.signal(signal.SIGINT, lambda *_: came.append(True))
     try:
-        importlib.import_module("torchvo360.cli.jobs")
+        imported = importlib.import_module(module)
     finally:
         signal.signal(signal.SIGINT, before)
     if came:
         raise KeyboardInterrupt
+    return imported
 
 
 def _main(overrides: Sequence[str], multirun: bool, show: bool) -> int:

@@ -55,10 +55,10 @@ class Call:
 def run(words: Sequence[str]) -> int:
     """Evaluate what the words behind the command's name ask for, and return the exit code.
 
-    What cannot be evaluated is told and does not keep the others from it.
+    What cannot be evaluated or written is told and does not keep the others from it.
 
     Raises:
-        InputError: The words are not ours, or a truth for all or a table cannot be read or written.
+        InputError: The words are not ours, or a truth for all cannot be read.
     """
     call = parse(words)
     one_truth = _read_truth(call.truths[0]) if len(call.truths) == 1 else None
@@ -73,9 +73,12 @@ def run(words: Sequence[str]) -> int:
     if rows:
         summary = summary_rows(rows, "name") if len(rows) > 1 else []
         table = Table([Column("name", "name"), *FIGURES], rows, summary)
-        print(f"{caption(call.config)}\n\n{table.as_text()}", end="", flush=True)
+        print(f"{caption(call.config, rows)}\n\n{table.as_text()}", end="", flush=True)
         for out in call.outs:
-            write_table(out, table)
+            try:
+                write_table(out, table)
+            except InputError as error:
+                complaints.append(str(error))
     for complaint in complaints:
         print(f"{NAME}: {complaint}", file=sys.stderr)
     return 2 if complaints else 0
@@ -122,12 +125,13 @@ def _settings(overrides: Sequence[str]) -> EvaluateConfig:
     return config
 
 
-def caption(config: EvaluateConfig) -> str:
-    """Return what the columns of the table rest on."""
+def caption(config: EvaluateConfig, rows: Sequence[Row]) -> str:
+    """Return what the columns of the table rest on; a short estimate has its RPE over fewer poses than asked for."""
     lengths = "10 to 50 % of the path"
     if config.lengths is not None:
         lengths = ", ".join(f"{length:g}" for length in config.lengths) + " m"
-    over = f"RPE over {config.frames} poses, drift over {lengths}"
+    frames = sorted({row["rpe_frames"] for row in rows if isinstance(row["rpe_frames"], int)})
+    over = f"RPE over {' to '.join(map(str, frames[:1] + frames[1:][-1:]))} poses, drift over {lengths}"
     return f"Alignment {config.align}; ATE and RPE are root mean squares; {over}."
 
 
@@ -145,6 +149,8 @@ def _row(path: str, truth: Trajectory | None, config: EvaluateConfig) -> Row:
 
 
 def _read_truth(path: str) -> Trajectory:
+    if not path:
+        raise InputError("truth: expected a TUM file, got an empty name.")
     try:
         return read_tum(path)
     except InputError as error:

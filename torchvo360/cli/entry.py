@@ -1,15 +1,17 @@
 """The entry that smaller commands share: help, environment, and one sentence for the caller's mistake."""
 
-import importlib
 import os
+import signal
 import sys
 from collections.abc import Sequence
 
-from torchvo360.cli.command import ENVIRONMENT, conf_folder
+from torchvo360.cli.command import ENVIRONMENT, conf_folder, import_undisturbed
 
 
 def run_command(name: str, help_file: str, module: str, argv: Sequence[str] | None) -> int:
-    """Run a command and return its exit code: its own, 2 for the caller's mistake, 130 for Ctrl-C.
+    """Run a command and return its exit code: its own, or 2, 130 or 141 for what is told below.
+
+    2 is the caller's mistake, told in one sentence, 130 Ctrl-C, 141 that nobody reads the output any more.
 
     Args:
         name: The command's name.
@@ -25,13 +27,32 @@ def run_command(name: str, help_file: str, module: str, argv: Sequence[str] | No
     for key, value in ENVIRONMENT.items():
         os.environ.setdefault(key, value)
     try:
+        command = import_undisturbed(module)
         from torchvo360.checks import InputError
 
         try:
-            return importlib.import_module(module).run(words)
+            _check_homes(words)
+            return command.run(words)
         except InputError as error:
             print(f"{name}: {error}", file=sys.stderr)
             return 2
+    except BrokenPipeError:  # who read the output has gone, as `head` does
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # or Python complains when it flushes at the end
+        return 128 + signal.SIGPIPE
     except KeyboardInterrupt:
         print(f"{name}: interrupted.", file=sys.stderr)
         return 130
+
+
+def _check_homes(words: Sequence[str]) -> None:
+    """Refuse `~name` of an unknown user, which `Path.expanduser` answers with a RuntimeError.
+
+    Raises:
+        InputError: There is such a one.
+    """
+    from torchvo360.checks import InputError
+
+    for word in words:
+        key, equal, value = word.rpartition("=")
+        if value.startswith("~") and os.path.expanduser(value) == value:
+            raise InputError(f"{key}{': ' * bool(equal)}expected a known user's folder, got {value}.")

@@ -8,6 +8,7 @@ from omegaconf.errors import OmegaConfBaseException
 
 from torchvo360.checks import InputError, check_choice
 from torchvo360.cli import overrides as ours
+from torchvo360.export.cubemap import check_faces
 from torchvo360.export.recorded import KEYFRAMES
 
 NAMES = {
@@ -46,7 +47,7 @@ class ExportConfig:
     fov: float = 90.0
     """Angle across each, degrees, 90 to 120."""
     size: int | None = None
-    """Width and height of each, pixels; null keeps the panorama's resolution."""
+    """Width and height of each, pixels, 8 to 8192; null keeps the panorama's resolution."""
     image: str = "jpg"
     """Kind of image files, jpg or png."""
     progress: bool = True
@@ -59,6 +60,9 @@ class ExportConfig:
             raise InputError("run: expected the folder of a run, or input=PATH to make one, got neither.")
         if self.frames != KEYFRAMES and not (self.frames.isdecimal() and int(self.frames) > 0):
             raise InputError(f"frames: expected keyframes or a number such as 10, got {self.frames}.")
+        check_faces(self.faces, self.fov, self.size)
+        if self.out == "":
+            raise InputError("out: expected a name, got an empty one.")
         usual = {field.name: field.default for field in fields(ExportConfig)}
         for names, formats in ((("faces", "fov", "size"), ("colmap",)), (("image",), DATA_SETS)):
             for name in names:

@@ -2,6 +2,7 @@
 
 import signal
 import sys
+import tempfile
 import threading
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -76,7 +77,9 @@ def export(settings: ExportConfig, for_the_run: Sequence[str] = ()) -> list[str]
         InputError: The caller's mistake; then nothing is written, and what was there is as before.
     """
     if settings.run is None:
-        _check_free(settings, Path(settings.out or NAMES[settings.format]).expanduser())
+        if settings.out is not None:
+            _check_free(settings, Path(settings.out).expanduser())
+            _check_writable(Path(settings.out).expanduser())
         folder = _make_run(settings, for_the_run)
     else:
         folder = Path(settings.run).expanduser()
@@ -139,6 +142,8 @@ def _open(folder: Path, moved_to: str | None) -> Opened:
     file = folder / "config.yaml"
     try:
         content = OmegaConf.load(file)
+        if "input" not in content:
+            raise ValueError("no input")
         config = OmegaConf.masked_copy(content, [key for key in INPUT_KEYS if key in content])  # pyright: ignore[reportArgumentType]
         settings = OmegaConf.merge(OmegaConf.structured(RunConfig), config)
     except OSError as error:
@@ -195,3 +200,17 @@ def _check_free(settings: ExportConfig, out: Path) -> None:
         raise InputError(f"out: expected a new name, or overwrite=true, got {out}, which is there.")
     if is_folder and (foreign := sorted(held - OURS)):
         raise InputError(f"out: expected a folder that an export wrote, got {out}, which holds {foreign[0]}.")
+
+
+def _check_writable(out: Path) -> None:
+    """Refuse a place that cannot be written before a run is made for it.
+
+    Raises:
+        InputError: It is such a one.
+    """
+    above = next(path for path in out.absolute().parents if path.exists())
+    try:
+        tempfile.TemporaryFile(dir=above).close()
+    except OSError as error:
+        why = error.strerror or error
+        raise InputError(f"out: expected a place that can be written, got {out}: {why}.") from None

@@ -1,6 +1,7 @@
 """What `torchvo360-plan` does: the map, the way, and the files."""
 
 import json
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -13,7 +14,7 @@ from torchvo360.checks import InputError
 from torchvo360.cli.plan_settings import PlanSettings, settings_of
 from torchvo360.cli.surroundings import Surroundings, read_surroundings
 from torchvo360.files import atomic_path, write_atomically
-from torchvo360.mapping import OccupancyMap, build_map, find_floor, read_map, upright_axes, write_map
+from torchvo360.mapping import OccupancyMap, build_map, find_floor, read_map, unit_of_map, upright_axes, write_map
 from torchvo360.mapping.level import map_frame
 from torchvo360.outputs import can_plot, new_folder
 from torchvo360.planning import Plan, PlanConfig, clearance_of, plan_path
@@ -70,10 +71,13 @@ def run(words: Sequence[str]) -> int:
 
 def _ground_of_map(settings: PlanSettings) -> Ground:
     try:
-        occupancy = read_map(settings.map or "")
+        occupancy, unit = read_map(settings.map or ""), unit_of_map(settings.map or "")
     except InputError as error:
         raise InputError(f"map: {error}") from None
-    return Ground(occupancy, "m", 1.0)
+    for name in ("robot_radius", "margin"):
+        if unit != "m" and getattr(settings, name) is None:
+            raise InputError(f"{name}: expected a length in the map's unit, which is not the metre, got none.")
+    return Ground(occupancy, unit, 1.0)
 
 
 def _ground_of_run(settings: PlanSettings) -> Ground:
@@ -131,15 +135,16 @@ def _write(
     if plan.found:
         lines = ["x,y", *(f"{round(x, 6):.9g},{round(y, 6):.9g}" for x, y in plan.xy.tolist())]
         write_atomically(folder / "path.csv", "\n".join(lines) + "\n")
-    else:
-        (folder / "path.csv").unlink(missing_ok=True)  # an earlier plan's
     told = {"reason": str(plan.reason), "message": plan.message, "unit": ground.unit, "start": ends[0], "goal": ends[1]}
     if plan.found:
-        told |= {"length": plan.length, "cost": plan.cost, "clearance": plan.clearance}
+        told |= {"length": plan.length, "cost": plan.cost}
+        told["clearance"] = plan.clearance if math.isfinite(plan.clearance) else None  # JSON has no infinity
     told |= {"searched": plan.searched, "seconds": plan.seconds, "nearest": plan.nearest}
     if ground.S_map_world is not None:
         told["S_map_world"] = ground.S_map_world.tolist()
     write_atomically(folder / "plan.json", json.dumps(told, indent=2, allow_nan=False) + "\n")
+    if not plan.found:
+        (folder / "path.csv").unlink(missing_ok=True)  # an earlier plan's
     if settings.plot == "false" or not can_plot():
         (folder / "plan.png").unlink(missing_ok=True)  # an earlier plan's
     else:
@@ -166,10 +171,11 @@ def _described(ground: Ground, plan: Plan, ends: Sequence[tuple[float, float]]) 
     ]
     if not plan.found:
         return [*lines, plan.message]
+    near = math.isfinite(plan.clearance)
     x, y, u, v = (round(value, 6) + 0.0 for end in ends for value in end)  # neither 1e-28 nor -0
     return [
         *lines,
         f"way: {plan.length:.3g} {unit} from ({x:.4g}, {y:.4g}) to ({u:.4g}, {v:.4g}), {len(plan.xy)} corners, "
-        f"at least {plan.clearance:.3g} {unit} from obstacles",
+        + (f"at least {plan.clearance:.3g} {unit} from obstacles" if near else "without any obstacle on the map"),
         f"search: {plan.searched} cells in {1e3 * plan.seconds:.0f} ms",
     ]

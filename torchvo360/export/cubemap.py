@@ -35,6 +35,9 @@ MARGIN = 2
 
 MAX_FOV_DEG = 120.0
 
+MAX_SIZE = 8192
+"""Pixels: the look-up table of one face then takes half a gigabyte."""
+
 
 @dataclass(frozen=True, eq=False)
 class View:
@@ -67,7 +70,7 @@ class Views:
             camera: A panorama; or a pinhole, whose images stay as they are whatever the other arguments say.
             faces: 6, or 4 for those around the horizon.
             fov_deg: Angle across a face, degrees, 90 to 120: above 90 neighbours overlap.
-            size: Width and height of a face, pixels; None keeps the panorama's resolution.
+            size: Width and height of a face, pixels, 8 to 8192; None keeps the panorama's resolution.
 
         Raises:
             InputError: An argument is not one of these, or the camera neither of those.
@@ -76,15 +79,11 @@ class Views:
             return cls(camera, (View("", camera, torch.eye(4, dtype=torch.float64)),))
         if not isinstance(camera, Equirectangular):
             raise InputError(f"camera: expected a panorama or a pinhole, got {type(camera).__name__}.")
-        if faces not in (4, 6):
-            raise InputError(f"faces: expected 4 or 6, got {faces!r}.")
-        check_finite_number("fov", fov_deg, above=90.0 - 1e-9, at_most=MAX_FOV_DEG)
+        check_faces(faces, fov_deg, size)
         across = 2 * math.tan(math.radians(fov_deg) / 2)
         kept = 2 * math.ceil(across / camera.pixel_angle / 2)
         if size is None:
             size = kept
-        if not isinstance(size, int) or isinstance(size, bool) or size < 8:
-            raise InputError(f"size: expected an integer of at least 8, got {size!r}.")
         pinhole = Pinhole(size, size, size / across, size / across, size / 2, size / 2)
         views = []
         for name in list(ROWS)[:faces]:
@@ -120,6 +119,19 @@ class Views:
 
     def _remapped(self, padded: UInt8[np.ndarray, "H W 3"], at: Float32[np.ndarray, "h w 2"], how: int) -> np.ndarray:
         return _shrunk(cv2.remap(padded, at[..., 0], at[..., 1], how, borderMode=cv2.BORDER_REPLICATE), self.finer)
+
+
+def check_faces(faces: int, fov_deg: float, size: int | None) -> None:
+    """Refuse what `Views.of` cannot make faces of.
+
+    Raises:
+        InputError: An argument is out of range.
+    """
+    if faces not in (4, 6):
+        raise InputError(f"faces: expected 4 or 6, got {faces!r}.")
+    check_finite_number("fov", fov_deg, above=90.0 - 1e-9, at_most=MAX_FOV_DEG)
+    if size is not None and not (type(size) is int and 8 <= size <= MAX_SIZE):
+        raise InputError(f"size: expected an integer from 8 to {MAX_SIZE}, got {size!r}.")
 
 
 def _look_up(

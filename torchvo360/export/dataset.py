@@ -127,13 +127,15 @@ def export_colmap(folder: Path, material: Material, views: Views, progress: Prog
         progress: Is told of every frame, of both readings.
 
     Raises:
-        InputError: The input is another one by now, or none of its frames can be used.
+        InputError: The input is another one by now, none of its frames can be used, or the mask hides all faces.
         OSError: A file cannot be written.
     """
     known, camera, pose_of = material.recorded, material.camera, material.recorded.pose_of()
     patches = _looks(material, pose_of, progress)
     shown = views.cut_mask(material.mask)
     is_cut = [bool(mask.mean() >= LEAST_SHOWN) for mask in shown]
+    if not any(is_cut):
+        raise InputError("faces: expected some of which the mask leaves more than 2 %, got none.")
     for name in (IMAGES, SPARSE, *([MASKS] if material.mask is not None else [])):
         (folder / name).mkdir(parents=True)
     images_of: dict[int, list[PosedImage]] = {}

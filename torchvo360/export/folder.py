@@ -25,12 +25,12 @@ def atomic_folder(final: Path) -> Iterator[Path]:
     try:
         temporary.mkdir(parents=True)
         yield temporary
-        if final.exists():
-            os.replace(final, before)
         try:
+            if final.exists():
+                os.replace(final, before)
             os.replace(temporary, final)
         except BaseException:
-            if before.exists():
+            if before.exists() and not final.exists():
                 os.replace(before, final)
             raise
     finally:

@@ -63,7 +63,7 @@ def read_ply(path: str | Path) -> tuple[Float[Tensor, "N 3"], UInt8[Tensor, "N 3
     """Read what `write_ply` wrote: points, colours and frames.
 
     Raises:
-        InputError: The file is missing, cut off, or another program's.
+        InputError: The file is missing, cut off, damaged, or another program's.
     """
     try:
         data = Path(path).read_bytes()
@@ -77,4 +77,6 @@ def read_ply(path: str | Path) -> tuple[Float[Tensor, "N 3"], UInt8[Tensor, "N 3
     if len(body) != count * VERTEX.itemsize:
         raise InputError(f"{path}: expected {count} points, got {len(body) // VERTEX.itemsize}: the file is cut off.")
     vertices = np.frombuffer(body, VERTEX)
+    if not np.isfinite(vertices["xyz"]).all():
+        raise InputError(f"{path}: expected finite coordinates, got others: the file is damaged.")
     return tuple(torch.from_numpy(vertices[name].copy(order="C")) for name in ("xyz", "rgb", "frame"))  # pyright: ignore[reportReturnType]

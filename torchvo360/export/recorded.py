@@ -2,6 +2,7 @@
 
 import csv
 import json
+import math
 from collections import Counter
 from dataclasses import dataclass
 from decimal import Decimal, InvalidOperation
@@ -16,6 +17,7 @@ from torchvo360.checks import InputError
 from torchvo360.data.trajectory import Trajectory
 from torchvo360.data.tum import read_tum
 from torchvo360.export.ply import read_ply
+from torchvo360.vo import State
 
 KEYFRAMES = "keyframes"
 
@@ -107,11 +109,11 @@ def read_recorded(folder: str | Path) -> Recorded:
     try:
         summary = json.loads((root / "summary.json").read_text(encoding="utf-8"))
         width, height = int(summary["width"]), int(summary["height"])
-        intrinsics, gravity = (_numbers(summary.get(name)) for name in ("intrinsics", "gravity"))
+        intrinsics, gravity = _numbers(summary.get("intrinsics"), 4), _numbers(summary.get("gravity"), 3)
     except OSError as error:
         got = f"{folder}, without summary.json ({error.strerror})"
         raise InputError(f"run: expected the folder of a finished run, got {got}.") from None
-    except (ValueError, KeyError, TypeError):
+    except (ValueError, KeyError, TypeError, OverflowError):
         raise InputError(f"run: expected a summary.json that torchvo360 wrote, got another one in {folder}.") from None
     try:
         trajectory = read_tum(root / "trajectory.txt")
@@ -119,10 +121,13 @@ def read_recorded(folder: str | Path) -> Recorded:
     except InputError as error:
         raise InputError(f"run: {error}") from None
     index, t_ns, state = _read_frames(root / "frames.csv")
+    if strange := int((~torch.isin(trajectory.t_ns, t_ns)).sum()):
+        got = f"{strange} poses in trajectory.txt at times of no frame in frames.csv"
+        raise InputError(f"run: expected files of one run in {folder}, got {got}.")
     return Recorded(
         trajectory,
-        torch.tensor(index),
-        torch.tensor(t_ns),
+        index,
+        t_ns,
         state,
         xyz,
         rgb,
@@ -134,20 +139,26 @@ def read_recorded(folder: str | Path) -> Recorded:
     )
 
 
-def _numbers(values: list[float] | None) -> list[float] | None:
-    return None if values is None else [float(value) for value in values]
+def _numbers(values: list[float] | None, count: int) -> list[float] | None:
+    if values is None:
+        return None
+    numbers = [float(value) for value in values]
+    if len(numbers) != count or not all(map(math.isfinite, numbers)):
+        raise ValueError
+    return numbers
 
 
-def _read_frames(path: Path) -> tuple[list[int], list[int], list[str]]:
+def _read_frames(path: Path) -> tuple[Int64[Tensor, "M"], Int64[Tensor, "M"], list[str]]:
     try:
         with path.open(newline="", encoding="utf-8") as file:
             rows = list(csv.DictReader(file))
-        index = [int(row["index"]) for row in rows]
-        t_ns = [int((Decimal(row["time"]) * 10**9).to_integral_value()) for row in rows]
-        state = [row["state"] for row in rows]
+        index = torch.tensor([int(row["index"]) for row in rows], dtype=torch.int64)
+        times = (Decimal(row["time"]) * 10**9 for row in rows)
+        t_ns = torch.tensor([int(time.to_integral_value()) for time in times], dtype=torch.int64)
+        state = [State(row["state"]).value for row in rows]
     except OSError as error:
         raise InputError(f"run: expected {path}, got {error.strerror}.") from None
-    except (ValueError, KeyError, TypeError, InvalidOperation, csv.Error):
+    except (ValueError, KeyError, TypeError, OverflowError, InvalidOperation, csv.Error):
         raise InputError(f"run: expected frames as torchvo360 writes them, got others in {path}.") from None
     if not rows:
         raise InputError(f"run: expected frames in {path}, got none.")

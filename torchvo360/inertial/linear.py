@@ -12,6 +12,7 @@ from torch import Tensor
 from torchvo360.inertial.joint import MAX_LOG_SCALE, Poses, State, scaled
 from torchvo360.inertial.samples import GRAVITY
 from torchvo360.lie import so3_left_jacobian, so3_log
+from torchvo360.solve import solve_ldl
 
 BIAS_STEPS = 3
 """Of Gauss-Newton; the second leaves a millionth of the bias."""
@@ -19,6 +20,10 @@ FEWEST = 4
 """Poses: with three there is one measured acceleration and nothing to check it by."""
 APART_S = 0.25
 """Between the poses that are used for the scale: over less, their noise outweighs what the IMU measures, seconds."""
+
+
+RIDGE = 1e-12
+"""Share of a column's square that keeps one that no row speaks of from being divided by zero."""
 
 
 def fit_gyro_bias(poses: Poses) -> Float64[Tensor, "3"] | None:
@@ -33,7 +38,7 @@ def fit_gyro_bias(poses: Poses) -> Float64[Tensor, "3"] | None:
         r = so3_log(pre.dR.mT @ turn)
         J = -torch.linalg.inv(so3_left_jacobian(r)) @ pre.J_R_bg  # Log(Exp(-J d) E)
         weight = pre.ok.to(r)[:, None]
-        bias[:3] += torch.linalg.lstsq((J * weight[..., None]).flatten(0, 1), -(r * weight).flatten()).solution
+        bias[:3] += _least_squares((J * weight[..., None]).flatten(0, 1), -(r * weight).flatten())
     return bias[:3]
 
 
@@ -62,7 +67,7 @@ def solve_linear(poses: Poses, bias_gyro: Float64[Tensor, "3"]) -> State | None:
     weight = pre.ok.to(T)[:, None]
     rows = torch.stack([rows_v * weight[..., None], rows_p * weight[..., None] / dt], 1).flatten(0, 2)
     right = torch.stack([right_v * weight, right_p * weight / dt[..., 0]], 1).flatten()
-    solution = torch.linalg.lstsq(rows, right, driver="gelsd").solution
+    solution = _least_squares(rows, right)
     scale, gravity = solution[-4], solution[-3:]
     length = torch.linalg.vector_norm(gravity)
     if not bool(scale > math.exp(-MAX_LOG_SCALE)) or not bool(length > GRAVITY / 10):
@@ -78,3 +83,15 @@ def _apart(t_ns: Int64[Tensor, "N"]) -> Int64[Tensor, "M"]:
     slot = (t_ns - t_ns[0]) // round(APART_S * 1e9)
     first = torch.cat([slot.new_ones(1, dtype=torch.bool), slot.diff() > 0]).nonzero()[:, 0]
     return first if len(first) >= FEWEST else torch.arange(len(slot))
+
+
+def _least_squares(rows: Float64[Tensor, "R D"], right: Float64[Tensor, "R"]) -> Float64[Tensor, "D"]:
+    """Solve rows x = right; what no row speaks of is zero.
+
+    By the normal equations: LAPACK's least squares give other bits with other places in memory, and these are a start.
+    """
+    size = torch.linalg.vector_norm(rows, dim=0).clamp_min(1e-12)
+    J = rows / size
+    A = J.mT @ J + RIDGE * torch.eye(J.shape[1]).to(J)
+    x, ok = solve_ldl(A, J.mT @ right)
+    return torch.where(ok, x / size, torch.zeros_like(x))

@@ -16,6 +16,10 @@ MOST_CELLS = 25_000_000
 """A map of 5,000 x 5,000; more is a mistake in the resolution far sooner than a place."""
 
 
+MOST_RESOLUTION = 1e6
+"""Distances on any map stay finite in single precision."""
+
+
 @dataclass(frozen=True, eq=False)
 class OccupancyMap:
     """Cells of the floor, seen from above: x to the right, y upwards on the page; row 0 holds the lowest y."""
@@ -31,7 +35,7 @@ class OccupancyMap:
         check_shape("states", self.states, "H W")
         if self.states.dtype != torch.int8 or self.states.numel() == 0:
             raise InputError(f"states: expected cells of int8, got {list(self.states.shape)} of {self.states.dtype}.")
-        check_finite_number("resolution", self.resolution, above=0.0)
+        check_finite_number("resolution", self.resolution, above=0.0, at_most=MOST_RESOLUTION)
         for value in self.origin:
             check_finite_number("origin", value)
 

@@ -63,6 +63,9 @@ class MapConfig:
             value = getattr(self, name)
             if not (math.isfinite(value) and value >= 0):
                 raise InputError(f"{name}: expected a finite number of at least 0, got {value!r}.")
+        if self.max_range < self.resolution:
+            least = f"the resolution of {self.resolution:g}"
+            raise InputError(f"max_range: expected at least {least}, got {self.max_range:g}.")
         if self.step >= self.robot_height:
             raise InputError(f"step: expected less than the robot's height {self.robot_height:g}, got {self.step:g}.")
 
@@ -158,9 +161,8 @@ def _voxels(
     """
     layers = max(1, math.ceil((config.robot_height + config.step) / config.layer))
     if layers * shape[0] * shape[1] > MOST_VOXELS:
-        least = config.layer * layers * shape[0] * shape[1] / MOST_VOXELS
-        cells = f"{shape[0]} x {shape[1]} cells"
-        raise InputError(f"layer: expected at least {least:.3g} for {cells}, got {config.layer:g}.")
+        most = f"{MOST_VOXELS // (shape[0] * shape[1])} layers of {config.layer:.3g} on {shape[1]} x {shape[0]} cells"
+        raise InputError(f"robot_height: expected at most {most}, got {layers:.6g}.")
     grid = (layers, *shape)
     thickness = (config.robot_height + config.step) / layers
     size = torch.tensor([config.resolution, config.resolution, thickness], dtype=torch.float64)

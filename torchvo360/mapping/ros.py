@@ -4,8 +4,9 @@ Source: the map_server and nav2_map_server packages: an image whose first row ha
 for free and 205 for unknown, `origin` the pose of its lower left corner. Their unit is the metre.
 """
 
-import math
 import re
+import reprlib
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +19,11 @@ from torchvo360.mapping.grid import FREE, MOST_CELLS, OCCUPIED, UNKNOWN, Occupan
 
 PIXELS = {FREE: 254, OCCUPIED: 0, UNKNOWN: 205}
 OCCUPIED_THRESH, FREE_THRESH = 0.65, 0.196
+
+MOST_TEXT = 65_536
+"""Characters of a yaml file or of an image's header; a real one has some hundred."""
+
+OTHER_UNIT = "# lengths are in {}, not in metres\n"
 
 REQUIRED = ("image", "resolution", "origin", "negate", "occupied_thresh", "free_thresh")
 
@@ -46,7 +52,7 @@ def write_map(folder: str | Path, occupancy: OccupancyMap, *, name: str = "map",
         "occupied_thresh": OCCUPIED_THRESH,
         "free_thresh": FREE_THRESH,
     }
-    comment = "" if unit == "m" else f"# lengths are in {unit}, not in metres\n"
+    comment = "" if unit == "m" else OTHER_UNIT.format(unit)
     write_atomically(path, comment + yaml.safe_dump(settings, sort_keys=False, default_flow_style=None))
     return path
 
@@ -58,19 +64,21 @@ def read_map(path: str | Path) -> OccupancyMap:
         InputError: A file is missing or not of the format, or the map is turned.
     """
     path = Path(path).expanduser()
-    settings = _settings(path)
+    settings = _settings(path, _text(path))
     occupied_above, free_below = (_number(path, settings, key) for key in ("occupied_thresh", "free_thresh"))
     resolution = _number(path, settings, "resolution")
     origin = settings["origin"]
     if not (isinstance(origin, list) and len(origin) == 3 and all(_is_number(value) for value in origin)):
-        raise InputError(f"{path}: expected origin: [x, y, yaw], got {origin!r}.")
+        raise InputError(f"{path}: expected origin: [x, y, yaw], got {_shown(origin)}.")
     if resolution <= 0 or origin[2] != 0:
         raise InputError(f"{path}: expected a resolution above 0 and a yaw of 0, got {resolution:g} and {origin[2]:g}.")
     if not 0 <= free_below <= occupied_above <= 1:
         got = f"{free_below:g} and {occupied_above:g}"
         raise InputError(f"{path}: expected 0 <= free_thresh <= occupied_thresh <= 1, got {got}.")
     if settings.get("mode", "trinary") not in ("trinary", "scale"):
-        raise InputError(f"{path}: expected mode trinary or scale, got {settings['mode']!r}.")
+        raise InputError(f"{path}: expected mode trinary or scale, got {_shown(settings['mode'])}.")
+    if settings["negate"] not in (0, 1):
+        raise InputError(f"{path}: expected negate 0 or 1, got {_shown(settings['negate'])}.")
     pixels = _pixels(_beside(path, settings["image"])).flip(0).double()
     occupied = (pixels if settings["negate"] else 255 - pixels) / 255
     states = torch.full(pixels.shape, UNKNOWN, dtype=torch.int8)
@@ -79,12 +87,33 @@ def read_map(path: str | Path) -> OccupancyMap:
     return OccupancyMap(states, resolution, (float(origin[0]), float(origin[1])))
 
 
-def _settings(path: Path) -> dict[str, Any]:
+def unit_of_map(path: str | Path) -> str:
+    """Return the unit of a map's lengths: the metre, unless the comment of `write_map` names another.
+
+    Raises:
+        InputError: The file cannot be read.
+    """
+    found = re.match(OTHER_UNIT.format(r"(\w+)"), _text(Path(path).expanduser()))
+    return "m" if found is None else found[1]
+
+
+def _text(path: Path) -> str:
     try:
-        settings = yaml.safe_load(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise InputError(f"{path}: expected a map's yaml file, got none: {error.strerror}.") from None
-    except (UnicodeDecodeError, yaml.YAMLError):
+        with path.open(encoding="utf-8") as file:
+            text = file.read(MOST_TEXT + 1)
+    except (OSError, ValueError) as error:  # ValueError: not UTF-8, or a zero byte in the name
+        if isinstance(error, OSError):
+            raise InputError(f"{path}: expected a map's yaml file, got none: {error.strerror}.") from None
+        raise InputError(f"{path}: expected a map's yaml file, got another file.") from None
+    if len(text) > MOST_TEXT:
+        raise InputError(f"{path}: expected a map's yaml file, got one of more than {MOST_TEXT} characters.")
+    return text
+
+
+def _settings(path: Path, text: str) -> dict[str, Any]:
+    try:
+        settings = yaml.safe_load(text)
+    except (yaml.YAMLError, ValueError, RecursionError):  # an impossible date or number, brackets without end
         raise InputError(f"{path}: expected a map's yaml file, got another file.") from None
     missing = [key for key in REQUIRED if not isinstance(settings, dict) or key not in settings]
     if missing:
@@ -92,20 +121,26 @@ def _settings(path: Path) -> dict[str, Any]:
     return settings
 
 
+def _shown(value: Any) -> str:
+    """Return a value's beginning, for a message."""
+    return reprlib.repr(value)[:60]
+
+
 def _is_number(value: Any) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
+    """Return whether a value is a finite number that has a float."""
+    return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) <= sys.float_info.max
 
 
 def _number(path: Path, settings: dict[str, Any], key: str) -> float:
     if not _is_number(settings[key]):
-        raise InputError(f"{path}: expected a number for {key}, got {settings[key]!r}.")
+        raise InputError(f"{path}: expected a number for {key}, got {_shown(settings[key])}.")
     return float(settings[key])
 
 
 def _beside(path: Path, image: Any) -> Path:
     """Return the image's path, which must not lead out of the map's folder."""
-    if not isinstance(image, str) or not image:
-        raise InputError(f"{path}: expected the name of an image, got {image!r}.")
+    if not isinstance(image, str) or not image or "\0" in image:
+        raise InputError(f"{path}: expected the name of an image, got {_shown(image)}.")
     found = (path.parent / image).resolve()
     if not found.is_relative_to(path.parent.resolve()):
         raise InputError(f"{path}: expected an image in the map's folder, got {image}.")
@@ -115,7 +150,8 @@ def _beside(path: Path, image: Any) -> Path:
 def _pixels(path: Path) -> torch.Tensor:
     """Read a binary PGM of 8 bits."""
     try:
-        data = path.read_bytes()
+        with path.open("rb") as file:
+            data = file.read(MOST_TEXT + MOST_CELLS)
     except OSError as error:
         raise InputError(f"{path}: expected a map's image, got none: {error.strerror}.") from None
     blank = rb"(?:\s|#[^\n]*\n)+"
@@ -123,7 +159,9 @@ def _pixels(path: Path) -> torch.Tensor:
     if head is None:
         raise InputError(f"{path}: expected a binary PGM image of 8 bits, got another file.")
     columns, rows = int(head[1]), int(head[2])
+    if not 0 < rows * columns <= MOST_CELLS:
+        raise InputError(f"{path}: expected 1 to {MOST_CELLS} cells, got {columns} x {rows}.")
     body = data[head.end() :]
-    if not 0 < rows * columns <= MOST_CELLS or len(body) < rows * columns:
+    if len(body) < rows * columns:
         raise InputError(f"{path}: expected {columns} x {rows} pixels, got {len(body)}: the file is cut off.")
     return torch.frombuffer(bytearray(body[: rows * columns]), dtype=torch.uint8).view(rows, columns)

@@ -9,14 +9,16 @@ from jaxtyping import Float32
 from torchvo360.mapping import OCCUPIED, UNKNOWN, OccupancyMap
 from torchvo360.planning.config import PlanConfig
 
+LEAST_MARGIN = 1e-30
+"""A smaller one is none, and has no inverse in single precision."""
+
 
 @dataclass(frozen=True, eq=False)
 class Clearance:
     """A map as a robot sees it."""
 
     distance: Float32[np.ndarray, "H W"]
-    """From each cell's middle to the nearest obstacle's edge, in the map's unit; the map's diagonal where there is
-    none."""
+    """From each cell's middle to the nearest obstacle's edge, in the map's unit; inf where there is none."""
     weight: Float32[np.ndarray, "H W"]
     """Cost of a way through a cell per unit of its length, at least 1; inf where the robot does not fit."""
 
@@ -33,11 +35,12 @@ def clearance_of(occupancy: OccupancyMap, config: PlanConfig) -> Clearance:
         blocked = blocked | (states == UNKNOWN)
     padded = np.pad(blocked, 1, constant_values=outside)
     cells = cv2.distanceTransform((~padded).view(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)[1:-1, 1:-1]
-    diagonal = np.float32(np.hypot(*states.shape))
-    distance = np.float32(occupancy.resolution) * np.clip(cells - np.float32(0.5), 0, diagonal)
+    distance = np.float32(occupancy.resolution) * np.maximum(cells - np.float32(0.5), 0)
+    if not padded.any():
+        distance[:] = np.inf
     weight = np.ones(states.shape, np.float32)
     if config.margin > 0 and config.clearance_weight > 0:
-        near = 1 - (distance - np.float32(config.robot_radius)) * np.float32(1 / config.margin)
+        near = 1 - (distance - np.float32(config.robot_radius)) * np.float32(1 / max(config.margin, LEAST_MARGIN))
         np.clip(near, 0, 1, out=near)
         weight += np.float32(config.clearance_weight) * (near * near)  # its slope ends at 0, where the margin does
     if not outside and config.unknown_weight > 0:

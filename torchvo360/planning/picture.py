@@ -82,7 +82,8 @@ def draw_plan(
     handles = [Patch(facecolor=colour, edgecolor=INK, linewidth=0.5, label=name) for name, colour in areas]
     handles += axes.get_legend_handles_labels()[0]
     figure.legend(handles=handles, loc="outside lower center", ncols=5, frameon=False, fontsize=9, labelcolor=INK)
-    title = f"{plan.length:.3g} {unit}, {plan.clearance:.2g} {unit} clear" if plan.found else plan.message
+    clear = f"{plan.clearance:.2g} {unit} clear" if np.isfinite(plan.clearance) else "no obstacle"
+    title = f"{plan.length:.3g} {unit}, {clear}" if plan.found else plan.message
     axes.set_title(title, fontsize=11 if plan.found else 9, color=INK, wrap=True)
     figure.savefig(path, dpi=140, facecolor="white")
 
@@ -111,9 +112,10 @@ def _draw_scale_bar(axes, unit: str) -> None:
     longest = BAR_SHARE * (right - left)
     power = 10 ** np.floor(np.log10(longest))
     length = next(step * power for step in (5, 2, 1) if step * power <= longest)
+    told = "unit" if (length, unit) == (1, "units") else unit
     x, y = left + 0.04 * (right - left), bottom + 0.05 * (top - bottom)
     axes.plot([x, x + length], [y, y], color="white", linewidth=6, solid_capstyle="butt")
     axes.plot([x, x + length], [y, y], color=INK, linewidth=3, solid_capstyle="butt")
     box = {"facecolor": "white", "edgecolor": "none", "alpha": 0.8, "pad": 1.5}
-    axes.text(x + length / 2, y + 0.015 * (top - bottom), f"{length:g} {unit}", ha="center", va="bottom", fontsize=9,
+    axes.text(x + length / 2, y + 0.015 * (top - bottom), f"{length:g} {told}", ha="center", va="bottom", fontsize=9,
               color=INK, bbox=box)  # fmt: skip

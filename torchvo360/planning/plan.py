@@ -48,7 +48,8 @@ class Plan:
     cost: float
     """What A* minimised: length times weight, in the map's unit, along the cells of the grid."""
     clearance: float
-    """Least distance from the way to an obstacle's edge, in the map's unit; 0 where there is no way."""
+    """Least distance from the way to an obstacle's edge, in the map's unit; inf on a map without obstacles, 0 without a
+    way."""
     searched: int
     """Cells that the search looked at."""
     seconds: float

@@ -14,8 +14,9 @@ from torchvo360.data.frame import Frame
 from torchvo360.data.synthetic import SyntheticConfig, SyntheticSequence
 from torchvo360.evaluation import evaluate
 from torchvo360.motion.essential import TwoView, inverse_ranges
-from torchvo360.vo import OdometryConfig, State, VisualOdometry, initialise
+from torchvo360.vo import OdometryConfig, State, VisualOdometry
 from torchvo360.vo.frame import FrameBuilder
+from torchvo360.vo.start import initialise
 from torchvo360.vo.start.initialise import InitialiseConfig, Initialiser, Start
 from torchvo360.vo.start.refine import JointState
 from torchvo360.window import Window

@@ -1,7 +1,7 @@
 """One run of a benchmark, in a process of its own: its death is a line in the table, and not the benchmark's.
 
 The folder of a job holds the run's results, what it said (log.txt), and a record (job.json) of how its process ended. A
-launcher's workers import this module: it needs neither PyTorch nor OpenCV.
+launcher's workers import this module.
 """
 
 import json

@@ -12,8 +12,12 @@ function setTheme(theme) {
   charts.draw();
   drawStrip(element("strip"));
 }
-dark.addEventListener("change", () => setTheme(dark.matches ? "dark" : "light"));
-element("theme").addEventListener("click", () => setTheme(root.dataset.theme === "dark" ? "light" : "dark"));
+const followSystem = () => setTheme(dark.matches ? "dark" : "light");
+dark.addEventListener("change", followSystem);
+element("theme").addEventListener("click", () => {
+  dark.removeEventListener("change", followSystem);
+  setTheme(root.dataset.theme === "dark" ? "light" : "dark");
+});
 
 // Views
 const floorStep = Math.max(roundStep(box.radius / 3), 1e-9);
@@ -44,7 +48,7 @@ for (const [id, view, options] of [
   const scene = viewOf(id, (canvas) => new Scene(canvas, view, { ...options, onPick: (row) => pick(row) }));
   if (!scene) continue;
   scenes.push(scene);
-  element(`${id}-reset`).addEventListener("click", () => { view.reset(); scene.redraw(); });
+  element(`${id}-reset`).addEventListener("click", () => scene.reset());
 }
 element("scene-scale").textContent = `grid: ${inUnit(floorStep)}`;
 
@@ -96,7 +100,7 @@ function pick(row) {
     ["Gain a", word(frames.a[row])], ["Offset b", word(frames.b[row])], ["Time", `${word(frames.milliseconds[row])} ms`],
   ];
   if (errors) rows.push(["Position error", `${word(errors.position_m[row])} m`], ["Rotation error", `${word(errors.rotation_deg[row])}°`]);
-  rows.push(["Position x, y, z", position, "wide"], ["Reason", meaning ? `${reason}: ${meaning}` : reason, "wide"]);
+  rows.push(["Position x, y, z, as in trajectory.txt", position, "wide"], ["Reason", meaning ? `${reason}: ${meaning}` : reason, "wide"]);
   fill(element("frame"), rows);
   markChange(row);
 }
@@ -220,7 +224,7 @@ const about = [
   ["Unusable frames", Object.entries(summary.unusable_frames || {}).map(([problem, count]) => `${count} ${problem}`).join(", ")],
   ["Coverage", Number.isFinite(summary.coverage) && `${word(100 * summary.coverage)}%`],
   ["Errors", errors && `RPE ${word(summary.rpe_translation_percent)}% and ${word(summary.rpe_rotation_deg)}°, scale ${word(summary.scale, 4)}`],
-  ["Unit", unit === "m" ? "metres" : "the median range that the first keyframe saw"],
+  ["Unit", summary.metric ? "metres" : content.points.total > 0 && `${errors ? "metres by the true poses; the run's own is " : ""}the median range that the first keyframe saw`],
   ["Gravity", summary.gravity && `${summary.gravity.map((value) => word(value, 4)).join(", ")} m/s² in the world's axes`],
   ["Duration", Number.isFinite(summary.seconds) && `${word(summary.seconds)} s, threads: ${summary.threads}`],
   ["Versions", Object.entries(summary.versions || {}).map(([name, version]) => `${name} ${version}`).join(", ")],

@@ -52,7 +52,8 @@ class Scene {
     this.floor = floor;
     this.shown = { points: true, soFar: false };
     this.picked = { row: 0, look: null, fov: 0 };
-    const moved = (move) => (...values) => { move.apply(view, values); this.redraw(); };
+    this.touched = false;
+    const moved = (move) => (...values) => { move.apply(view, values); this.touched = true; this.redraw(); };
     listen(canvas, {
       turn: view.turn && moved(view.turn),
       pan: moved(view.pan),
@@ -62,8 +63,15 @@ class Scene {
         if (row >= 0) onPick(row);
       },
     });
-    new ResizeObserver(() => this.redraw()).observe(canvas);
+    new ResizeObserver(() => { if (this.touched) this.redraw(); else this.reset(); }).observe(canvas);
     this.recolour();
+  }
+
+  // Shows all; until the view is touched this holds for another shape of the canvas, too.
+  reset() {
+    this.touched = false;
+    this.view.reset();
+    this.redraw();
   }
 
   // Lines carry their colours: they are made anew when the theme changes.

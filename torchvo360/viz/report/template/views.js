@@ -86,7 +86,8 @@ class FromAbove {
   }
 
   clipView(width, height) {
-    if (this.pixel === null) this.pixel = 1.08 * Math.max(boxAbove.size[0] / width, boxAbove.size[1] / (height - 40), (0.02 * boxAbove.radius) / height);
+    // at least as much as the lines of sight reach, where nothing has moved
+    if (this.pixel === null) this.pixel = 1.08 * Math.max(boxAbove.size[0] / width, boxAbove.size[1] / (height - 40), (0.4 * boxAbove.radius) / height);
     [this.width, this.height] = [width, height];
     const sx = 2 / (width * this.pixel), sy = 2 / (height * this.pixel), sz = 0.05 / box.radius;
     return new Float32Array([

@@ -1,0 +1,147 @@
+"""`linearize` on the compiled pass: tensors to arrays, and sums to normal equations."""
+
+import importlib
+import math
+from collections.abc import Callable
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from torchvo360.cameras import Equirectangular, Pinhole
+from torchvo360.checks import InputError, ShapeError, check_shape
+from torchvo360.residuals.direct import Reference, Target
+from torchvo360.residuals.normal import NormalEquations
+from torchvo360.residuals.weights import LOSSES, LossConfig, robust
+
+SPHERE, PINHOLE = 0, 1
+"""As in `kernel`, which cannot be imported without numba."""
+UPPER = np.array([[min(p, q) * (17 - min(p, q)) // 2 + max(p, q) for q in range(9)] for p in range(9)])
+"""Where an entry of the 9 x 9 matrix lies among the sums of its upper triangle."""
+
+NOTHING = np.empty((1, 0), np.float32), np.empty((1, 0, 0, 0), np.float32)
+"""Stand-ins for variances and confidences that are not there."""
+
+
+def serves(reference: Reference, target: Target, T_tgt_ref: Tensor, affine: Tensor) -> bool:
+    """Return whether `linearize` takes these: float32 on the CPU, a known camera, and no gradient asked."""
+    inputs = [
+        *(reference.ray, reference.rho, reference.value, reference.weight, reference.variance),
+        *(target.padded, target.confidence, target.intrinsics),
+    ]
+    tensors = [value for value in inputs if value is not None]
+    if torch.is_grad_enabled() and any(value.requires_grad for value in (*tensors, T_tgt_ref, affine)):
+        return False
+    return type(target.camera) in (Equirectangular, Pinhole) and all(
+        value.dtype == torch.float32 and value.device.type == "cpu" for value in tensors
+    )
+
+
+def linearize(
+    reference: Reference,
+    target: Target,
+    T_tgt_ref: Float[Tensor, "B 4 4"],
+    affine: Float[Tensor, "B 2"],
+    loss: LossConfig,
+    *,
+    noise: float = 4 / 255,
+) -> NormalEquations:
+    """Linearise as `backends.eager.linearize` does, in one pass over the points, on `torch.get_num_threads()` threads.
+
+    Arguments give the same bits on any number of threads, and a pair gives the same bits whatever else is in its batch.
+
+    Raises:
+        InputError: numba is missing (the extra `fast` brings it), or the arguments are not what `serves` says.
+        ShapeError: Shapes do not belong together.
+    """
+    if not serves(reference, target, T_tgt_ref, affine):
+        raise InputError(
+            "linearize: expected float32 tensors on the CPU without gradients, and a panorama or a pinhole, for numba, "
+            "got others."
+        )
+    _check_shapes(reference, target, T_tgt_ref, affine)
+    points = tuple(_array(x) for x in (reference.ray, reference.rho, reference.value, reference.weight))
+    variance = NOTHING[0] if reference.variance is None else _array(reference.variance)
+    confidence = NOTHING[1] if target.confidence is None else _array(target.confidence)
+    sums = _kernel()(
+        (*points, variance),
+        (_array(target.padded), confidence),
+        T_tgt_ref.detach().double().contiguous().numpy(),
+        affine.detach().double().contiguous().numpy(),
+        _intrinsics(target),
+        _optics(target),
+        _loss(loss, target.saturation, noise),
+        torch.get_num_threads(),
+    )
+    M = torch.from_numpy(sums[:, UPPER])
+    cost, weight = torch.from_numpy(sums[:, 45:].copy()).unbind(1)
+    return NormalEquations(M[:, :8, :8], M[:, :8, 8], cost, weight, M[:, 8, 8])
+
+
+def _array(value: Tensor) -> np.ndarray:
+    """Return a contiguous array; of what is expanded over the batch, its one element."""
+    if value.stride(0) == 0:
+        value = value[:1]
+    return value.detach().contiguous().numpy()
+
+
+def _intrinsics(target: Target) -> np.ndarray:
+    if target.intrinsics is None:
+        return np.array([target.camera.intrinsics], np.float32)
+    return _array(target.intrinsics)
+
+
+def _optics(target: Target) -> tuple[int, bool, bool, np.float32]:
+    camera = target.camera
+    if isinstance(camera, Pinhole):
+        return PINHOLE, False, False, np.float32(0)
+    _, fy, cx, _ = camera.intrinsics
+    centred = target.intrinsics is None and camera.wraps and cx == camera.width / 2
+    return SPHERE, camera.wraps, not centred, np.float32(math.sin(0.5 / fy) ** 2)
+
+
+def _loss(loss: LossConfig, saturation: float | None, noise: float) -> tuple[int | np.float32, ...]:
+    cutoff, most = math.inf, math.inf
+    if loss.cutoff is not None:
+        cutoff = loss.cutoff
+        most = float(robust(torch.tensor(cutoff), loss)[1])
+    clipped = math.inf if saturation is None else saturation
+    numbers = (loss.scale, loss.degrees_of_freedom, cutoff, most, clipped, noise)
+    return (LOSSES.index(loss.name), *(np.float32(number) for number in numbers))
+
+
+def _check_shapes(reference: Reference, target: Target, T_tgt_ref: Tensor, affine: Tensor) -> None:
+    """Refuse shapes that do not belong together: the compiled pass would read foreign memory."""
+    check_shape("reference.value", reference.value, "B C N")
+    B, (C, N) = T_tgt_ref.shape[0], reference.value.shape[1:]
+    height, width = target.camera.height + 2, target.camera.width + 2
+    expected: tuple[tuple[str, Tensor | None, tuple[int, ...]], ...] = (
+        ("T_tgt_ref", T_tgt_ref, (4, 4)),
+        ("affine", affine, (2,)),
+        ("reference.ray", reference.ray, (3, N)),
+        ("reference.rho", reference.rho, (N,)),
+        ("reference.value", reference.value, (C, N)),
+        ("reference.weight", reference.weight, (N,)),
+        ("reference.variance", reference.variance, (N,)),
+        ("target.padded", target.padded, (C, height, width)),
+        ("target.confidence", target.confidence, (1, height, width)),
+        ("target.intrinsics", target.intrinsics, (4,)),
+    )
+    for name, value, shape in expected:
+        if value is not None and (value.shape[1:] != shape or value.shape[0] not in (B, 1)):
+            raise ShapeError(f"{name}: expected shape {[B, *shape]}, got {list(value.shape)}.")
+    if affine.shape[0] != B:
+        raise ShapeError(f"affine: expected shape {[B, 2]}, got {list(affine.shape)}.")
+
+
+def _kernel() -> Callable[..., np.ndarray]:
+    """Import what numba has compiled: half a second, and some more the first time of all."""
+    try:
+        return importlib.import_module("torchvo360.backends.numba.kernel").sum_pairs
+    except ModuleNotFoundError as error:
+        if error.name != "numba":
+            raise
+        raise InputError(
+            "linearize: expected numba to be installed (pip install 'torchvo360[fast]'), got none."
+        ) from error

@@ -365,6 +365,7 @@ def prepare_bad_input(pictures) -> None:
 
 
 BAD = {
+    "input=~nobody_of_this_name/walk.mp4": "input: expected a known user's folder, got ~nobody_of_this_name/walk.mp4",
     # keys and values
     "inptu=x": "inptu: expected a known key such as input, got inptu=x",
     "vo.map.pints=3": "vo.map.points",

@@ -76,6 +76,20 @@ def import_undisturbed(module: str) -> ModuleType:
     return imported
 
 
+def check_homes(words: Sequence[str]) -> None:
+    """Refuse `~name` of an unknown user, which `Path.expanduser` answers with a RuntimeError.
+
+    Raises:
+        InputError: There is such a one.
+    """
+    from torchvo360.checks import InputError
+
+    for word in words:
+        key, equal, value = word.rpartition("=")
+        if value.startswith("~") and os.path.expanduser(value) == value:
+            raise InputError(f"{key}{': ' * bool(equal)}expected a known user's folder, got {value}.")
+
+
 def _main(overrides: Sequence[str], multirun: bool, show: bool) -> int:
     from torchvo360.checks import InputError
     from torchvo360.cli.configuration import compose
@@ -83,6 +97,7 @@ def _main(overrides: Sequence[str], multirun: bool, show: bool) -> int:
     from torchvo360.cli.overrides import to_yaml
 
     try:
+        check_homes([word for word in overrides if "=" in word])
         if multirun:
             return run_sweep(overrides, conf_folder())
         config = compose(overrides, conf_folder())

@@ -5,7 +5,7 @@ import signal
 import sys
 from collections.abc import Sequence
 
-from torchvo360.cli.command import ENVIRONMENT, conf_folder, import_undisturbed
+from torchvo360.cli.command import ENVIRONMENT, check_homes, conf_folder, import_undisturbed
 
 
 def run_command(name: str, help_file: str, module: str, argv: Sequence[str] | None) -> int:
@@ -31,7 +31,7 @@ def run_command(name: str, help_file: str, module: str, argv: Sequence[str] | No
         from torchvo360.checks import InputError
 
         try:
-            _check_homes(words)
+            check_homes(words)
             return command.run(words)
         except InputError as error:
             print(f"{name}: {error}", file=sys.stderr)
@@ -42,17 +42,3 @@ def run_command(name: str, help_file: str, module: str, argv: Sequence[str] | No
     except KeyboardInterrupt:
         print(f"{name}: interrupted.", file=sys.stderr)
         return 130
-
-
-def _check_homes(words: Sequence[str]) -> None:
-    """Refuse `~name` of an unknown user, which `Path.expanduser` answers with a RuntimeError.
-
-    Raises:
-        InputError: There is such a one.
-    """
-    from torchvo360.checks import InputError
-
-    for word in words:
-        key, equal, value = word.rpartition("=")
-        if value.startswith("~") and os.path.expanduser(value) == value:
-            raise InputError(f"{key}{': ' * bool(equal)}expected a known user's folder, got {value}.")

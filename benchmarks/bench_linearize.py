@@ -123,20 +123,20 @@ def main() -> None:
             for name, linearize in kernels.items():
                 times = alternate(native, partial(linearize, *problem, loss), arguments.seconds)
                 cpp, ours = zip(*times, strict=True)
-                plain, inner = error_of(linearize, problem, loss), error_of(linearize, inside, loss)
+                outer, inner = error_of(linearize, problem, loss), error_of(linearize, inside, loss)
                 print(
                     f"{B:2} x {H:3} x {W:4} | {name:6} | {min(cpp):6.2f} {middle(cpp):6.2f} | "
                     f"{min(ours):6.2f} {middle(ours):6.2f} | "
                     f"{min(ours) / min(cpp):4.1f} {middle(b / a for a, b in times):4.1f} | "
-                    f"{inner[0]:.0e} {inner[1]:.0e} ({plain[0]:.0e} {plain[1]:.0e})",
+                    f"{inner[0]:.0e} {inner[1]:.0e} ({outer[0]:.0e} {outer[1]:.0e})",
                     flush=True,
                 )
     if "numba" not in kernels:
         return
     for B in (1, 8):
         problem = few_points(B, 3000)
-        calls = (partial(linearize, *problem, LossConfig()) for linearize in kernels.values())
-        times = alternate(*calls, arguments.seconds)
+        plain, compiled = (partial(linearize, *problem, LossConfig()) for linearize in kernels.values())
+        times = alternate(plain, compiled, arguments.seconds)
         torchs, ours = (min(column) * 1e3 for column in zip(*times, strict=True))
         print(f"{B} x 3000 points: eager {torchs:.0f} us, numba {ours:.0f} us, ratio {ours / torchs:.2f}")
     starts = [seconds_to_start() for _ in range(5)]

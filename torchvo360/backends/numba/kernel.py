@@ -367,34 +367,21 @@ def _sum_part(s, index, b, first, last, points, images, T, affine, k, optics, lo
     sums[45], sums[46] = total_cost, total_weight
 
 
-@njit(cache=True)
-def _sum_parts(worker, workers, parts, N, points, images, T, affine, k, optics, loss, each):
+@njit(cache=True, nogil=True)
+def _sum_parts(worker, workers, parts, points, images, T, affine, k, optics, loss, sums):
     """Sum every so many of the parts, in one scratch array: in memory newly given by the system every page costs."""
     s, index = np.empty(SCRATCH, f4), np.empty(BLOCK, np.uint32)
-    for task in range(worker, len(each), workers):
+    N = points[1].shape[1]
+    for task in range(worker, len(sums), workers):
         b, first = task // parts, task % parts * PART
-        _sum_part(s, index, b, first, min(first + PART, N), points, images, T, affine, k, optics, loss, each[task])
+        _sum_part(s, index, b, first, min(first + PART, N), points, images, T, affine, k, optics, loss, sums[task])
 
 
-@njit(cache=True, parallel=True, nogil=True)
-def _sum_pairs(points, images, T, affine, k, optics, loss, threads):
-    B, N = T.shape[0], points[1].shape[1]
-    parts = max((N + PART - 1) // PART, 1)
-    tasks = B * parts
-    each = np.zeros((tasks, SUMS))
-    workers = min(threads, tasks)
-    if workers > 1:
-        for worker in prange(workers):
-            _sum_parts(worker, workers, parts, N, points, images, T, affine, k, optics, loss, each)
-    else:
-        # Without the threading layer, which takes its time and dies in a process forked from one that has used it.
-        _sum_parts(0, 1, parts, N, points, images, T, affine, k, optics, loss, each)
-    sums = np.zeros((B, SUMS))
-    for b in range(B):
-        for part in range(parts):
-            for m in range(SUMS):
-                sums[b, m] += each[b * parts + part, m]
-    return sums
+@njit(cache=True, nogil=True, parallel=True)
+def _sum_in_threads(workers, parts, points, images, T, affine, k, optics, loss, sums):
+    # Nothing else here: numba hands an innocent np.zeros out to all threads, and waits for them.
+    for worker in prange(workers):
+        _sum_parts(worker, workers, parts, points, images, T, affine, k, optics, loss, sums)
 
 
 def sum_pairs(
@@ -424,16 +411,22 @@ def sum_pairs(
     Returns:
         [B, SUMS], float64.
     """
-    arguments = points, images, T, affine, k, optics, loss
-    if threads == 1:
-        return _sum_pairs(*arguments, 1)
-    before = get_num_threads()
-    threads = min(threads, before)
-    set_num_threads(threads)
-    try:
-        return _sum_pairs(*arguments, threads)
-    finally:
-        set_num_threads(before)
+    B, N = len(T), points[1].shape[1]
+    parts = max((N + PART - 1) // PART, 1)
+    sums = np.zeros((B * parts, SUMS))
+    arguments = parts, points, images, T, affine, k, optics, loss, sums
+    workers = min(threads, B * parts)
+    if workers <= 1:
+        # Without the threading layer, which takes its time and dies in a process forked from one that has used it.
+        _sum_parts(0, 1, *arguments)
+    else:
+        before = get_num_threads()
+        set_num_threads(min(workers, before))
+        try:
+            _sum_in_threads(workers, *arguments)
+        finally:
+            set_num_threads(before)
+    return sums.reshape(B, parts, SUMS).sum(1)
 
 
 def _start_threads() -> None:

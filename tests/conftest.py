@@ -1,5 +1,7 @@
 """Settings of all tests: one thread, so that sums have one order, and the data that may lie beside the repository."""
 
+import signal
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -19,3 +21,11 @@ def shared() -> Path:
     if not SHARED.is_dir():
         pytest.skip("the folder `shared` is not beside the repository")
     return SHARED
+
+
+@pytest.fixture
+def listening() -> Iterator[None]:
+    """Ctrl-C is heard, even where the tests run in the background of a shell, which has it ignored."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)

@@ -212,7 +212,7 @@ def test_a_folder_with_other_settings_is_not_mixed_up(capsys):
     assert Path("b/table.csv").read_bytes() == before
 
 
-@pytest.mark.usefixtures("stub")
+@pytest.mark.usefixtures("stub", "listening")
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
 def test_a_stopped_benchmark_keeps_what_is_finished(number):
     dataset = write_list("good", "waits", "other")

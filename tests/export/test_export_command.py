@@ -378,6 +378,7 @@ def test_a_folder_that_cannot_get_its_name_puts_the_old_one_back(tmp_path, monke
     assert content(tmp_path) == {"data/old": b"old"}
 
 
+@pytest.mark.usefixtures("listening")
 @pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
 def test_a_signal_ends_it_and_leaves_nothing_half_written(run_folder, monkeypatch, number, code):
     def interrupted(path, image):

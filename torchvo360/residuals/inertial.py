@@ -77,26 +77,6 @@ class Preintegrated(NamedTuple):
         """Derivative of the rotation: dR(b + d) = dR(b) Exp(J_R_bg d)."""
         return self.J_bias[..., ROTATION, GYRO]
 
-    @property
-    def J_v_bg(self) -> Float64[Tensor, "*batch 3 3"]:
-        """Derivative of dv by the gyro's bias."""
-        return self.J_bias[..., VELOCITY, GYRO]
-
-    @property
-    def J_v_ba(self) -> Float64[Tensor, "*batch 3 3"]:
-        """Derivative of dv by the accelerometer's bias."""
-        return self.J_bias[..., VELOCITY, ACCEL]
-
-    @property
-    def J_p_bg(self) -> Float64[Tensor, "*batch 3 3"]:
-        """Derivative of dp by the gyro's bias."""
-        return self.J_bias[..., POSITION, GYRO]
-
-    @property
-    def J_p_ba(self) -> Float64[Tensor, "*batch 3 3"]:
-        """Derivative of dp by the accelerometer's bias."""
-        return self.J_bias[..., POSITION, ACCEL]
-
     def take(self, index: Tensor | slice | int) -> "Preintegrated":
         """Return the segments of an index, a mask, a slice or one place."""
         return Preintegrated(*(value[index] for value in self))

@@ -13,7 +13,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 from torchvo360 import lie
-from torchvo360.backends import eager, linearize, numba
+from torchvo360.backends import eager, numba
+from torchvo360.backends.eager import linearize
 from torchvo360.cameras import Camera, Equirectangular, Pinhole
 from torchvo360.image import pad_image
 from torchvo360.residuals.direct import Reference, Target, by_rho, look_up, make_target

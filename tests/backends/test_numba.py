@@ -232,7 +232,7 @@ def test_without_numba_it_names_the_extra_and_selection_does_without(monkeypatch
     monkeypatch.setattr(select, "has_numba", lambda: False)
     select.linearize(*problem, HUBER)
     monkeypatch.setitem(sys.modules, "numba", None)
-    monkeypatch.delitem(sys.modules, "torchvo360.backends.numba.kernel", raising=False)
+    monkeypatch.delitem(sys.modules, "torchvo360.backends.numba.kernels.pairs", raising=False)
     with pytest.raises(InputError, match=r"^linearize: expected numba .*torchvo360\[fast\]"):
         linearize(*problem, HUBER)
 
@@ -243,7 +243,7 @@ def test_numba_is_imported_by_its_first_call_alone_and_leaves_torchs_threads():
         assert not any(name == "numba" or name.startswith("numba.") for name in sys.modules)
         for threads in (1, 2):
             torch.set_num_threads(threads)
-            import torchvo360.backends.numba.kernel
+            import torchvo360.backends.numba.kernels.pairs
             assert torch.get_num_threads() == threads
     """
     subprocess.run([sys.executable, "-c", code], check=True, timeout=100)

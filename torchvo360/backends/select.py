@@ -1,14 +1,24 @@
-"""`linearize` on the fastest backend there is for its arguments."""
+"""Which backend computes: numba where it is installed and serves, else eager torch, or the one that was asked for."""
 
+import functools
 import importlib.util
+from collections.abc import Iterator
+from contextlib import contextmanager
 
+import torch
 from jaxtyping import Float
 from torch import Tensor
+from torch.autograd import forward_ad
 
 from torchvo360.backends import eager, numba
+from torchvo360.checks import InputError, check_choice
 from torchvo360.residuals.direct import Reference, Target
 from torchvo360.residuals.normal import NormalEquations
 from torchvo360.residuals.weights import LossConfig
+
+BACKENDS = ("auto", "eager", "numba")
+
+_asked = "auto"
 
 
 def linearize(
@@ -20,11 +30,56 @@ def linearize(
     *,
     noise: float = 4 / 255,
 ) -> NormalEquations:
-    """Linearise as `backends.eager.linearize` does: by numba where it is installed and serves, else in eager torch."""
-    compiled = has_numba() and numba.serves(reference, target, T_tgt_ref, affine)
+    """Linearise as `backends.eager.linearize` does, on the backend asked for, else the fastest there is for these."""
+    compiled = use_numba() and numba.serves(reference, target, T_tgt_ref, affine)
     return (numba if compiled else eager).linearize(reference, target, T_tgt_ref, affine, loss, noise=noise)
 
 
+@contextmanager
+def backend(name: str) -> Iterator[None]:
+    """Compute on a backend while this is entered, in all threads.
+
+    Args:
+        name: auto; eager: torch alone; numba: as auto, but refused where it is not installed.
+
+    Raises:
+        InputError: It is none of these, or numba is not installed.
+    """
+    global _asked
+    check_choice("backend", name, BACKENDS)
+    if name == "numba" and not has_numba():
+        raise InputError("backend: expected numba to be installed (pip install 'torchvo360[fast]'), got none.")
+    before, _asked = _asked, name
+    try:
+        yield
+    finally:
+        _asked = before
+
+
+def use_numba(*tensors: Tensor | None) -> bool:
+    """Return whether a pass of numba's is to compute: it is installed, not turned off, and serves these tensors.
+
+    It serves what is on the CPU and asks for no derivative: neither backwards, nor forwards, nor by `torch.func`; and
+    not what `torch.compile` compiles.
+    """
+    if _asked == "eager" or not has_numba() or _in_transform():
+        return False
+    gradients = torch.is_grad_enabled()
+    return all(
+        value is None or (value.device.type == "cpu" and not (gradients and value.requires_grad)) for value in tensors
+    )
+
+
+@functools.cache
 def has_numba() -> bool:
     """Return whether numba is installed."""
     return importlib.util.find_spec("numba") is not None
+
+
+def _in_transform() -> bool:
+    """Return whether tensors may be no plain numbers: compiled, mapped, or differentiated forwards."""
+    return (
+        torch.compiler.is_compiling()
+        or torch._C._functorch.peek_interpreter_stack() is not None
+        or forward_ad._current_level >= 0
+    )

@@ -16,7 +16,7 @@ from torchvo360.residuals.normal import NormalEquations
 from torchvo360.residuals.weights import LOSSES, LossConfig, robust
 
 SPHERE, PINHOLE = 0, 1
-"""As in `kernel`, which cannot be imported without numba."""
+"""As in `kernels.scratch`, which cannot be imported without numba."""
 UPPER = np.array([[min(p, q) * (17 - min(p, q)) // 2 + max(p, q) for q in range(9)] for p in range(9)])
 """Where an entry of the 9 x 9 matrix lies among the sums of its upper triangle."""
 
@@ -138,7 +138,7 @@ def _check_shapes(reference: Reference, target: Target, T_tgt_ref: Tensor, affin
 def _kernel() -> Callable[..., np.ndarray]:
     """Import what numba has compiled: half a second, and some more the first time of all."""
     try:
-        return importlib.import_module("torchvo360.backends.numba.kernel").sum_pairs
+        return importlib.import_module("torchvo360.backends.numba.kernels.pairs").sum_pairs
     except ModuleNotFoundError as error:
         if error.name != "numba":
             raise

@@ -62,7 +62,7 @@ def use_numba(*tensors: Tensor | None) -> bool:
     It serves what is on the CPU and asks for no derivative: neither backwards, nor forwards, nor by `torch.func`; and
     not what `torch.compile` compiles.
     """
-    if _asked == "eager" or not has_numba() or _in_transform():
+    if _in_transform() or _asked == "eager" or not has_numba():
         return False
     gradients = torch.is_grad_enabled()
     return all(
@@ -80,6 +80,6 @@ def _in_transform() -> bool:
     """Return whether tensors may be no plain numbers: compiled, mapped, or differentiated forwards."""
     return (
         torch.compiler.is_compiling()
-        or torch._C._functorch.peek_interpreter_stack() is not None
+        or torch._C._functorch.peek_interpreter_stack() is not None  # pyright: ignore[reportAttributeAccessIssue]
         or forward_ad._current_level >= 0
     )

@@ -30,6 +30,8 @@ class OdometryConfig:
     """Share below which the frame is LOST: false minima reach 0.07, true ones on real video at least 0.74."""
     restart_after: int = 15
     """Lost frames in a row after which a new map is started and joined to the old one."""
+    overlap: bool = True
+    """Make keyframes in a second thread while the next frames are tracked. The results are the same bits either way."""
     smooth: bool = False
     """Smooth the finished trajectory by the filter of the motion, forwards and backwards in time (Rauch, Tung and
     Striebel): every pose as far as its alignment left it open. It takes 3 ms a frame."""

@@ -1,6 +1,7 @@
 """Following a map from frame to frame: predict, track, recover, and make keyframes."""
 
 import math
+from concurrent.futures import Executor
 from dataclasses import dataclass, field
 
 import torch
@@ -13,6 +14,7 @@ from torchvo360.vo.config import OdometryConfig
 from torchvo360.vo.foresee import MAX_PREDICTED, Expected, Foresight
 from torchvo360.vo.frame import FrameBuilder, PyramidFrame
 from torchvo360.vo.keyframes.keyframe import Keyframe, KeyPoints
+from torchvo360.vo.keyframes.making import Making, begin, make
 from torchvo360.vo.keyframes.mapper import Mapper
 from torchvo360.vo.recover import Recovery
 from torchvo360.vo.track import Track, judge_points, track
@@ -66,6 +68,10 @@ class Follower:
     """The earlier keyframe that knows the present frame better than this map does, if one was found."""
     left: list[Keyframe] = field(default_factory=list)
     """Keyframes that left the window with the last frame."""
+    worker: Executor | None = None
+    """What makes keyframes while frames are tracked; None to make them at once."""
+    making: Making | None = None
+    """The keyframe that is to take over."""
 
     @property
     def T_map_cam(self) -> Float64[Tensor, "4 4"]:
@@ -117,6 +123,8 @@ class Follower:
         """
         self.bridged, self.left, self.elsewhere = {}, [], None
         config = self.config
+        if self.making is not None and self.age >= self.making.frames:
+            self.take_over()
         expected, limit = self._expected(frame.t_ns), config.map.max_relative_variance
         found = None
         for hypotheses in expected.hypotheses.split([1, len(expected.hypotheses) - 1]):
@@ -141,11 +149,11 @@ class Follower:
         self.foresight.learn(found, corrected, since, len(self.unplaced) + 1, dt_s, self.median_rho())
         self.T_cam_key, self.affine, self.inliers = found.T_cam_key, found.affine, found.inliers
         self.age += 1
-        if found.inliers >= config.weak_inliers:
-            self.mapper.observe(frame, found.T_cam_key, found.affine)
         judge_points(self.key, frame, found, config.map.max_difference)
+        self._note(frame, found)
         if self._keyframe_due(frame, found):
-            self._new_keyframe(frame, found)
+            self.take_over()
+            self._make_keyframe(frame, found)
         self.place(frame)
         if self.foresight.imu is not None:
             self.foresight.imu.note(frame.t_ns, self.T_map_cam[:3, :3])
@@ -176,6 +184,14 @@ class Follower:
         usual = math.degrees(self.key.mean_flow(self.foresight.motion)) * JUMP * (len(self.unplaced) + 1)
         return math.degrees(self.key.mean_flow(T_cam_last)) > max(MIN_JUMP_DEG, usual)
 
+    def _note(self, frame: PyramidFrame, found: Track) -> None:
+        """Look for candidates in a frame that was found well; those of a keyframe in the making wait for it."""
+        agrees = found.inliers >= self.config.weak_inliers
+        if self.making is not None:
+            self.making.tracked += [(frame, found)] * agrees
+        elif agrees:
+            self.mapper.observe(frame, found.T_cam_key, found.affine)
+
     def _keyframe_due(self, frame: PyramidFrame, found: Track) -> bool:
         settings = self.config.map
         if self.mapper.metric and frame.has_ranges:
@@ -193,16 +209,35 @@ class Follower:
             )
         )
 
-    def _new_keyframe(self, frame: PyramidFrame, found: Track) -> None:
+    def _make_keyframe(self, frame: PyramidFrame, found: Track) -> None:
+        """Go on against the present frame, with the points known so far until the mapper has made it a keyframe."""
         self.recovery.remember(self.key)
-        newest = self.mapper.window.frames[-1]
+        mapper, newest, T_new_old = self.mapper, self.mapper.window.frames[-1], found.T_cam_key
         a, b = newest.affine + found.affine
         b = b + (float(found.affine[0].exp()) - 1) * newest.affine[1]
-        T_new_old = found.T_cam_key
-        self.mapper.discard(self.key.points.score <= DISCARDED)
-        self.left = self.mapper.add_keyframe(frame, T_new_old @ newest.T_cam_world, torch.stack([a, b]))
+        mapper.discard(self.key.points.score <= DISCARDED)
+        mapper.begin_keyframe(frame, T_new_old @ newest.T_cam_world, torch.stack([a, b]))
+        frames = math.floor(self.config.map.lag * self.age)
+        # What takes part in every prediction cannot wait: an IMU's states, estimated intrinsics.
+        if self.foresight.imu is not None or self.config.window.calibrate or frames == 0:
+            self.key, self.left = make(mapper)
+        else:
+            self.key = mapper.reference()
+            self.making = begin(mapper, frames, self.worker)
         # What was bridged stays where it is, against the keyframe that is now the newest.
         self.bridged = {index: T @ lie.se3_inverse(T_new_old) for index, T in self.bridged.items()}
-        self.key = self.mapper.reference()
         self.T_cam_key, self.affine, self.age = _identity(), _no_change(), 0
         self.foresight.rekeyed(T_new_old, self.median_rho())
+
+    def wait(self) -> None:
+        """Wait until the mapper is at rest; what it makes still takes over at its time."""
+        if self.making is not None:
+            self.making.work.result()
+
+    def take_over(self) -> None:
+        """Go on against the points of the keyframe in the making, if there is one; wait for it where it must be."""
+        if (making := self.making) is None:
+            return
+        (self.key, self.left), self.making = making.work.result(), None
+        for frame, found in making.tracked:
+            self.mapper.observe(frame, found.T_cam_key, found.affine)

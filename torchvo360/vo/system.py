@@ -9,6 +9,7 @@ once.
 
 import math
 import time
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -132,6 +133,7 @@ class VisualOdometry:
         self._starter = Starter(self._builder, config, torch.Generator().manual_seed(seed), learned, stereo)
         self._atlas = Atlas()
         self._follower: Follower | None = None
+        self._worker = ThreadPoolExecutor(1, "keyframes") if config.overlap else None
         self._remembered_before, self._cameras_before = 0, self._builder.cameras
         self._lost = 0
 
@@ -161,6 +163,7 @@ class VisualOdometry:
         """Return all poses and points found so far; more steps may follow."""
         atlas, loops = self._atlas, list(self._loops.edges)
         if self._follower is not None:
+            self._follower.wait()
             loops += self._loops.search(self._follower.mapper.references())
         before = atlas.keyframes()
         metric = self._is_metric()
@@ -263,7 +266,9 @@ class VisualOdometry:
         mapper.imu = self._imu
         if self._imu is not None:
             self._imu.begin_map()
-        self._follower = Follower(self._builder, self.config, self._recovery, mapper, foresight, key)
+        self._follower = Follower(
+            self._builder, self.config, self._recovery, mapper, foresight, key, worker=self._worker
+        )
         self._follower.place(frame)
         self._lost = 0
 
@@ -276,18 +281,25 @@ class VisualOdometry:
         for index, T_cam_key in follower.bridged.items():
             self._atlas.anchor(index, follower.key.frame.index, lie.se3_inverse(T_cam_key))
         if (begun := self._starter.watch(frame, follower.T_map_cam)) is not None:
+            follower.take_over()
             return self._take_over(begun, frame)
         if (metric := follower.mapper.window.metric) is not None:
             self._measured(follower, metric)
-        joined = [self._atlas.join(edge) for key in follower.left for edge in self._loops.add(key)]
+        joined = self._close_loops(follower)
         T_world_cam = self._atlas.in_world(follower.T_map_cam)
         was_lost, self._lost = self._lost > 0, 0
-        if any(joined):
+        if joined:
             return _estimate(frame, T_world_cam, State.RELOCALISED, "maps_joined", found)
         if found.inliers < self.config.weak_inliers:
             return _estimate(frame, T_world_cam, State.WEAK, "low_agreement", found)
         state, reason = (State.RELOCALISED, "present_keyframe") if was_lost else (State.TRACKING, "ok")
         return _estimate(frame, T_world_cam, state, reason, found)
+
+    def _close_loops(self, follower: Follower) -> bool:
+        """Compare keyframes that have just left the window with the places seen before; whether that joined maps."""
+        left, follower.left = follower.left, []
+        joined = [self._atlas.join(edge) for key in left for edge in self._loops.add(key)]
+        return any(joined)
 
     def _measured(self, follower: Follower, metric: Metric) -> None:
         """Take in what the IMU says of the present map: its scale, unless that is known otherwise."""
@@ -309,6 +321,8 @@ class VisualOdometry:
     # Losses
 
     def _lose(self, follower: Follower, frame: PyramidFrame) -> FrameEstimate:
+        follower.take_over()
+        self._close_loops(follower)
         if self._starter.settling and not follower.mapper.settled:
             # The network misjudged its first keyframes: the corners have to do without.
             self._forget_map()

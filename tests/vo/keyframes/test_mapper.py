@@ -27,6 +27,11 @@ NO_CHANGE = torch.zeros(2, dtype=torch.float64)
 LIMIT = CONFIG.map.max_relative_variance
 
 
+def added(mapper: Mapper, frame: PyramidFrame, T_cam_world: Tensor, affine: Tensor) -> list[Keyframe]:
+    mapper.begin_keyframe(frame, T_cam_world, affine)
+    return mapper.finish_keyframe()
+
+
 class Scene:
     """Frames whose poses and ranges are known; the world is the first frame's camera."""
 
@@ -60,7 +65,7 @@ class Scene:
         for index in later:
             T = self.T(index)
             T[:3, 3] /= unit_m
-            mapper.add_keyframe(self.frame(index), off(index, 0.2, 5e-3 / unit_m) @ T, NO_CHANGE)
+            added(mapper, self.frame(index), off(index, 0.2, 5e-3 / unit_m) @ T, NO_CHANGE)
         return mapper
 
     def started(self, *later: int) -> Mapper:
@@ -68,7 +73,7 @@ class Scene:
         mapper = Mapper.begun(self.key(sigma=0.2), self.builder, CONFIG, known=False)
         mapper.open([(self.frame(4), off(4, 0.3, 0.01) @ self.T(4), NO_CHANGE)])
         for index in later:
-            mapper.add_keyframe(self.frame(index), off(index, 0.2, 5e-3) @ self.T(index), NO_CHANGE)
+            added(mapper, self.frame(index), off(index, 0.2, 5e-3) @ self.T(index), NO_CHANGE)
         return mapper
 
     def range_error(self, key: Keyframe, unit: float = 1.0) -> Tensor:
@@ -109,7 +114,7 @@ def test_known_ranges_pull_back_a_keyframe_that_was_tracked_too_far(scene):
     mapper = scene.known()
     T = scene.T(6)
     T[:3, 3] *= 1.08
-    mapper.add_keyframe(scene.frame(6), T, NO_CHANGE)
+    added(mapper, scene.frame(6), T, NO_CHANGE)
     assert baseline(mapper, 0, 6) / float(scene.T(6)[:3, 3].norm()) == pytest.approx(1.0, abs=0.02)
 
 
@@ -119,7 +124,7 @@ def test_a_start_holds_the_distance_of_its_keyframes_also_when_both_are_gone(sce
     opened = baseline(mapper, 0, 4)
     assert opened == pytest.approx(given, rel=0.005)
     for index in (10, 16, 22, 28, 34):
-        mapper.add_keyframe(scene.frame(index), off(index, 0.2, 5e-3) @ scene.T(index), NO_CHANGE)
+        added(mapper, scene.frame(index), off(index, 0.2, 5e-3) @ scene.T(index), NO_CHANGE)
         assert baseline(mapper, 0, 4) == pytest.approx(opened, rel=1e-3)
     assert {0, 4} <= set(mapper.settled)
     unit = opened / float(scene.T(4)[:3, 3].norm())
@@ -174,8 +179,8 @@ def test_points_behind_a_thing_in_front_are_left_out(scene, turned):
     image = scene.image(18).copy()
     image[40:88, (np.arange(104, 176) + turned) % 256] = 255 - image[40:88, (np.arange(104, 176) + turned) % 256]
     plain, covered = scene.known(6, 12), scene.known(6, 12)
-    plain.add_keyframe(scene.frame(18), scene.T(18), NO_CHANGE)
-    covered.add_keyframe(scene.frame(18, image), scene.T(18), NO_CHANGE)
+    added(plain, scene.frame(18), scene.T(18), NO_CHANGE)
+    added(covered, scene.frame(18, image), scene.T(18), NO_CHANGE)
     assert inside(plain.reference()) > 150
     assert inside(covered.reference()) < 0.35 * inside(plain.reference()), "what is as bright by chance stays"
     error = scene.range_error(covered.reference())
@@ -187,7 +192,7 @@ def test_the_reference_knows_another_exposure(scene):
     dim = (scene.image(12) * 0.5).astype(np.uint8)
     mapper = scene.known(6)
     affine = torch.tensor([math.log(0.5), 0.0], dtype=torch.float64)
-    mapper.add_keyframe(scene.frame(12, dim), scene.T(12), affine)
+    added(mapper, scene.frame(12, dim), scene.T(12), affine)
     key = mapper.reference()
     assert len(key.pixel) > 0.9 * len(scene.known(6, 12).reference().pixel)
     a, b = mapper.window.frames[-1].affine.tolist()
@@ -215,7 +220,7 @@ def test_keyframes_leave_the_oldest_first_and_their_poses_and_clouds_stay(scene)
     gone: list[int] = []
     kept: dict[int, tuple[Tensor, PointCloud]] = {}
     for index in (6, 12, 18, 24, 30):
-        left = mapper.add_keyframe(scene.frame(index), scene.T(index), NO_CHANGE)
+        left = added(mapper, scene.frame(index), scene.T(index), NO_CHANGE)
         gone += [key.index for key in left]
         for key in left:
             assert float(scene.range_error(key).median()) < 0.03
@@ -272,7 +277,7 @@ def test_close_keeps_poses_and_clouds_and_frees_images(scene):
 def test_candidates_ripen_in_the_frames_that_follow_and_become_points(scene):
     """The second keyframe is 3 cm from the first, where most ranges cannot be told yet."""
     mapper = Mapper.begun(scene.key(), scene.builder, CONFIG, known=True)
-    mapper.add_keyframe(scene.frame(1), scene.T(1), NO_CHANGE)
+    added(mapper, scene.frame(1), scene.T(1), NO_CHANGE)
     candidates = mapper.candidates
     assert candidates is not None
     assert candidates.frame.index == 1
@@ -286,7 +291,7 @@ def test_candidates_ripen_in_the_frames_that_follow_and_become_points(scene):
         mapper.observe(scene.frame(index), scene.T(index) @ lie.se3_inverse(scene.T(1)), NO_CHANGE)
     ripe = set(candidates.pixel[candidates.ripe(LIMIT)].tolist())
     assert len(ripe) > 0.5 * waiting
-    mapper.add_keyframe(scene.frame(9), scene.T(9), NO_CHANGE)
+    added(mapper, scene.frame(9), scene.T(9), NO_CHANGE)
     points = mapper.window.points
     assert points is not None
     own = points.pixel[points.host == 1]
@@ -306,11 +311,11 @@ def test_a_keyframe_without_texture_neither_stops_the_map_nor_moves_it(scene, ki
     value = {"grey": 90, "black": 0, "white": 255}[kind]
     blank = scene.frame(18, np.full((128, 256, 3), value, np.uint8))
     mapper = scene.known(6, 12)
-    mapper.add_keyframe(blank, scene.T(18), NO_CHANGE)
+    added(mapper, blank, scene.T(18), NO_CHANGE)
     mapper.observe(scene.frame(19), EYE, NO_CHANGE)
     for index in (24, 30, 36):
-        mapper.add_keyframe(scene.frame(index), scene.T(index), NO_CHANGE)
-    mapper.add_keyframe(scene.frame(39), scene.T(39), NO_CHANGE)
+        added(mapper, scene.frame(index), scene.T(index), NO_CHANGE)
+    added(mapper, scene.frame(39), scene.T(39), NO_CHANGE)
     for index, T in mapper.poses().items():
         assert bool(T.isfinite().all())
         if index != 18:
@@ -322,7 +327,7 @@ def test_a_keyframe_without_texture_neither_stops_the_map_nor_moves_it(scene, ki
 def test_where_all_is_masked_there_are_no_points_and_no_error():
     masked = Scene(mask=torch.zeros(128, 256, dtype=torch.bool))
     mapper = Mapper.begun(masked.key(), masked.builder, CONFIG, known=True)
-    mapper.add_keyframe(masked.frame(6), masked.T(6), NO_CHANGE)
+    added(mapper, masked.frame(6), masked.T(6), NO_CHANGE)
     key = mapper.reference()
     assert len(key.pixel) == 0
     assert all(len(part) == 0 for part in (key.slope, *key.points, *key.values))

@@ -11,10 +11,16 @@ from torchvo360.data.synthetic import SyntheticConfig, SyntheticSequence
 from torchvo360.vo import SENSOR, OdometryConfig
 from torchvo360.vo.frame import FrameBuilder, PyramidFrame
 from torchvo360.vo.keyframes.fresh import fresh_points
+from torchvo360.vo.keyframes.mapper import Mapper
 from torchvo360.vo.start.begin import Starter
 
 CONFIG = OdometryConfig(blur_px=0.5)
 SETTINGS = SyntheticConfig(camera="pinhole", width=240, height=180, frames=12, seed=2, depth_noise=0.01)
+
+
+def add_keyframe(mapper: Mapper, frame: PyramidFrame, T_cam_world: torch.Tensor, affine: torch.Tensor) -> None:
+    mapper.begin_keyframe(frame, T_cam_world, affine)
+    mapper.finish_keyframe()
 
 
 class Walk:
@@ -114,7 +120,7 @@ def test_a_keyframe_takes_the_sensors_ranges_and_traces_the_rest(walk):
     for index in (5, 10):
         nothing = torch.zeros(2, dtype=torch.float64)
         T_cam_world = walk.T_cam_key(index)
-        mapper.add_keyframe(walk.frame(index, known=half if index == 10 else None), T_cam_world, nothing)
+        add_keyframe(mapper, walk.frame(index, known=half if index == 10 else None), T_cam_world, nothing)
     points = mapper.window.points
     assert points is not None
     own = points.take((points.host == 2).nonzero()[:, 0])
@@ -131,7 +137,7 @@ def test_in_a_map_of_another_unit_the_sensor_has_no_say(walk):
     begun = walk.starter().add(walk.frame(0))
     assert begun is not None
     mapper = begun.mapper
-    mapper.add_keyframe(walk.frame(5), walk.T_cam_key(5), torch.zeros(2, dtype=torch.float64))
+    add_keyframe(mapper, walk.frame(5), walk.T_cam_key(5), torch.zeros(2, dtype=torch.float64))
     rest = (mapper.window, 1, [0], walk.frame(5), walk.builder, CONFIG)
     foreign, own = fresh_points(*rest), fresh_points(*rest, metric=True)
     assert (foreign.points.information == 0).all()

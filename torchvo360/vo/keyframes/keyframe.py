@@ -31,6 +31,9 @@ class MapConfig:
     """Mean angle by which translation moves the points at which a new keyframe is made."""
     max_keyframe_gap: int = 24
     """Frames after which a keyframe is made in any case, once there is some parallax."""
+    lag: float = 0.5
+    """Share of the frames from one keyframe to the next that are tracked by the points known before, while its own are
+    found: time in which the two overlap. With an IMU, and with estimated intrinsics, it is 0."""
     max_keyframe_gain: float = 0.4
     """Change of the log gain at which a new keyframe is made, once there is some parallax."""
     min_visible: float = 0.55
@@ -46,6 +49,7 @@ class MapConfig:
             raise InputError(f"max_keyframe_gap: expected at least 1, got {self.max_keyframe_gap}.")
         check_finite_number("min_visible", self.min_visible, above=-1e-9, at_most=1)
         check_finite_number("min_gradient", self.min_gradient, above=0)
+        check_finite_number("lag", self.lag, above=-1e-9, at_most=1)
         for name in ("keyframe_flow_deg", "max_keyframe_gain", "max_difference"):
             check_finite_number(name, getattr(self, name), above=0)
         check_finite_number("max_relative_variance", self.max_relative_variance, above=0)

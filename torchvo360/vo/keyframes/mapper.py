@@ -114,20 +114,24 @@ class Mapper:
         self._adjust(START_STEPS)
         self._cull()
 
-    def add_keyframe(
+    def begin_keyframe(
         self, frame: PyramidFrame, T_cam_world: Float64[Tensor, "4 4"], affine: Float64[Tensor, "2"]
-    ) -> list[Keyframe]:
-        """Make a tracked frame a keyframe: trace new points, adjust the window, let the oldest keyframe go.
+    ) -> None:
+        """Make a tracked frame a keyframe, which has no points of its own yet.
 
         Args:
             frame: The frame.
             T_cam_world: Where it was tracked.
             affine: Its brightness, of the scene as the first keyframe sees it.
+        """
+        self._add(frame, T_cam_world, affine)
+
+    def finish_keyframe(self) -> list[Keyframe]:
+        """Trace new points of the newest keyframe, adjust the window, let the oldest keyframe go.
 
         Returns:
             The keyframes that have left the window, with the map's points as they see them.
         """
-        self._add(frame, T_cam_world, affine)
         self._activate()
         place = len(self.frames) - 1
         others = list(range(place - 1, max(-1, place - 1 - self.config.trace.views), -1))

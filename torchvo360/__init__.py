@@ -9,13 +9,14 @@ if TYPE_CHECKING:
     from torchvo360.cameras import Equirectangular, Pinhole, Rig
     from torchvo360.evaluation import evaluate
     from torchvo360.solve import Status
-    from torchvo360.vo import VisualOdometry
+    from torchvo360.vo import OdometryBatch, VisualOdometry
 
 __all__ = [
     "Align",
     "AlignConfig",
     "AlignResult",
     "Equirectangular",
+    "OdometryBatch",
     "Pinhole",
     "Rig",
     "Status",
@@ -34,6 +35,7 @@ _HOMES = {
     "Pinhole": "cameras",
     "Rig": "cameras",
     "evaluate": "evaluation",
+    "OdometryBatch": "vo",
     "Status": "solve",
     "VisualOdometry": "vo",
 }

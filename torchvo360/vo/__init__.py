@@ -1,5 +1,6 @@
 """Visual odometry: from frames to poses and a map."""
 
+from torchvo360.vo.batch import OdometryBatch
 from torchvo360.vo.config import OdometryConfig
 from torchvo360.vo.keyframes.cloud import PointCloud
 from torchvo360.vo.start.begin import LEARNED, SENSOR, STEREO
@@ -11,6 +12,7 @@ __all__ = [
     "SENSOR",
     "STEREO",
     "FrameEstimate",
+    "OdometryBatch",
     "OdometryConfig",
     "OdometryResult",
     "PointCloud",

@@ -7,11 +7,10 @@ from concurrent.futures import Executor, Future
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
-import torch
-
 from torchvo360.vo.frame import PyramidFrame
 from torchvo360.vo.keyframes.keyframe import Keyframe
 from torchvo360.vo.keyframes.mapper import Mapper
+from torchvo360.vo.modes import in_present_modes
 from torchvo360.vo.track import Track
 
 
@@ -53,10 +52,4 @@ def begin(mapper: Mapper, frames: int, worker: Executor | None) -> Making:
         done: Future[Made] = Future()
         done.set_result(make(mapper))
         return Making(done, frames)
-    inference, gradients = torch.is_inference_mode_enabled(), torch.is_grad_enabled()
-
-    def work() -> Made:
-        with torch.inference_mode(inference), torch.set_grad_enabled(gradients):
-            return make(mapper)
-
-    return Making(worker.submit(work), frames)
+    return Making(worker.submit(in_present_modes(make), mapper), frames)

@@ -1,0 +1,20 @@
+"""Work handed to other threads, where torch's modes of gradients begin anew."""
+
+from collections.abc import Callable
+from typing import ParamSpec, TypeVar
+
+import torch
+
+P = ParamSpec("P")
+R = TypeVar("R")
+
+
+def in_present_modes(work: Callable[P, R]) -> Callable[P, R]:
+    """Return a function that works in the present thread's modes of gradients, whatever thread calls it."""
+    inference, gradients = torch.is_inference_mode_enabled(), torch.is_grad_enabled()
+
+    def work_likewise(*args: P.args, **kwargs: P.kwargs) -> R:
+        with torch.inference_mode(inference), torch.set_grad_enabled(gradients):
+            return work(*args, **kwargs)
+
+    return work_likewise

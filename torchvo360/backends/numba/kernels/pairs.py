@@ -85,20 +85,21 @@ def sum_part(s, index, b, first, last, points, images, T, affine, k, optics, los
 
 
 @compiled(nogil=True)
-def _sum_parts(worker, workers, parts, points, images, T, affine, k, optics, loss, sums):
-    """Sum every so many of the parts, in one scratch array: in memory newly given by the system every page costs."""
+def _sum_parts(worker, workers, parts, places, points, images, T, affine, k, optics, loss, sums):
+    """Sum every so many of some pairs' parts, in one scratch array: newly given memory costs at every page."""
     s, index = np.empty(SCRATCH, f4), np.empty(BLOCK, np.uint32)
     N = points[1].shape[1]
     for task in range(worker, len(sums), workers):
-        b, first = task // parts, task % parts * PART
+        b, first = places[task // parts], task % parts * PART
         sum_part(s, index, b, first, min(first + PART, N), points, images, T, affine, k, optics, loss, sums[task])
 
 
 @compiled(nogil=True, parallel=True)
-def _sum_in_threads(workers, parts, points, images, T, affine, k, optics, loss, sums):
+def sum_in_threads(workers, parts, places, points, images, T, affine, k, optics, loss, sums):
+    """Sum the parts of the pairs at some places of a batch, one pair's after the other's."""
     # Nothing else here: numba hands an innocent np.zeros out to all threads, and waits for them.
     for worker in prange(workers):
-        _sum_parts(worker, workers, parts, points, images, T, affine, k, optics, loss, sums)
+        _sum_parts(worker, workers, parts, places, points, images, T, affine, k, optics, loss, sums)
 
 
 def sum_pairs(
@@ -131,7 +132,7 @@ def sum_pairs(
     B, N = len(T), points[1].shape[1]
     parts = max((N + PART - 1) // PART, 1)
     sums = np.zeros((B * parts, SUMS))
-    arguments = parts, points, images, T, affine, k, optics, loss, sums
+    arguments = parts, np.arange(B), points, images, T, affine, k, optics, loss, sums
     workers = min(threads, B * parts)
     if workers <= 1:
         # Without the threading layer, which takes its time and dies in a process forked from one that has used it.
@@ -140,7 +141,7 @@ def sum_pairs(
         before = get_num_threads()
         set_num_threads(min(workers, before))
         try:
-            _sum_in_threads(workers, *arguments)
+            sum_in_threads(workers, *arguments)
         finally:
             set_num_threads(before)
     return sums.reshape(B, parts, SUMS).sum(1)

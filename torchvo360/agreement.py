@@ -4,8 +4,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from torchvo360.cameras import Camera
-from torchvo360.residuals.direct import Reference, Samples, Target, look_up
+from torchvo360.backends import Comparison, compare
+from torchvo360.residuals.direct import Reference, Target
 
 TOLERANCE_PX = 0.5
 """A residual agrees if a displacement of this many pixels along the gradient would explain it."""
@@ -29,21 +29,20 @@ def agreeing_share(
     Returns:
         Between 0 and 1; 0 where the images have no gradient or no point is seen.
     """
-    dtype = reference.value.dtype
-    return share_beyond_chance(look_up(reference, target, T_tgt_ref.to(dtype), affine.to(dtype)), target.camera)
+    return share_beyond_chance(compare(reference, target, T_tgt_ref, affine))
 
 
-def share_beyond_chance(samples: Samples, camera: Camera) -> Float[Tensor, "B"]:
-    """Return `agreeing_share` of samples that have been looked up already."""
-    value = samples.residual + samples.gained
-    total = samples.weight.sum(2, keepdim=True).clamp_min(torch.finfo(samples.weight.dtype).tiny)
-    mean = (value * samples.weight).sum(2, keepdim=True) / total
-    chance = share_of_samples(samples._replace(residual=value - mean), camera)
-    share = share_of_samples(samples, camera)
+def share_beyond_chance(found: Comparison) -> Float[Tensor, "B"]:
+    """Return `agreeing_share` of what has been compared already."""
+    total = found.weight.sum(2, keepdim=True).clamp_min(torch.finfo(found.weight.dtype).tiny)
+    mean = (found.value * found.weight).sum(2, keepdim=True) / total
+    energy = found.weight * found.slope2
+    chance = _share_of(found.value - mean, energy, found.slope2)
+    share = _share_of(found.residual, energy, found.slope2)
     return ((share - chance) / (1 - chance).clamp_min(1e-3)).clamp_min(0.0)
 
 
-def share_of_samples(samples: Samples, camera: Camera) -> Float[Tensor, "B"]:
+def explained_share(found: Comparison) -> Float[Tensor, "B"]:
     """Return the share of the samples' gradient energy whose residuals are smaller than half a pixel's displacement.
 
     Residuals are measured by the gradient they stand on: neither exposure, nor contrast, nor smooth areas count. True
@@ -52,9 +51,11 @@ def share_of_samples(samples: Samples, camera: Camera) -> Float[Tensor, "B"]:
     Returns:
         Between 0 and 1; 0 where the images have no gradient or no point is seen.
     """
-    Gx, Gy, Gz = samples.G
-    slope2 = (Gx * Gx + Gy * Gy + Gz * Gz) * camera.pixel_angle**2
-    energy = samples.weight * slope2
-    explained = energy * (samples.residual**2 < TOLERANCE_PX**2 * slope2)
-    total = energy.sum((1, 2))
-    return explained.sum((1, 2)) / total.clamp_min(torch.finfo(energy.dtype).tiny)
+    return _share_of(found.residual, found.weight * found.slope2, found.slope2)
+
+
+def _share_of(
+    residual: Float[Tensor, "B C N"], energy: Float[Tensor, "B C N"], slope2: Float[Tensor, "B C N"]
+) -> Float[Tensor, "B"]:
+    explained = energy * (residual.square() < TOLERANCE_PX**2 * slope2)
+    return explained.sum((1, 2)) / energy.sum((1, 2)).clamp_min(torch.finfo(energy.dtype).tiny)

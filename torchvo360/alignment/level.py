@@ -1,4 +1,4 @@
-"""Alignment at one resolution: where to start the brightness, and the solve."""
+"""Alignment at one resolution: where to start the brightness, and the solve: compiled where it serves (`compiled`)."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ from jaxtyping import Bool, Float, Float64
 from torch import Tensor
 
 from torchvo360 import lie
+from torchvo360.alignment import compiled
 from torchvo360.alignment.config import AlignConfig
 from torchvo360.backends import linearize
 from torchvo360.residuals.direct import Reference, Target, look_up
@@ -141,6 +142,19 @@ def solve_level(
     """
     B = T_tgt_ref.shape[0]
     free = free_parameters(config, T_tgt_ref.device) if free is None else free
+    if not traced and compiled.serves(reference, target, T_tgt_ref, affine, *(prior or ())):
+        return compiled.solve(
+            reference,
+            target,
+            T_tgt_ref,
+            affine,
+            config,
+            max_steps=max_steps,
+            free=free,
+            prior=prior,
+            max_translation=MAX_TRANSLATION,
+            max_log_gain=MAX_LOG_GAIN,
+        )
     problem = level_problem(reference, target, config, free, prior)
     per_radian = 1 / target.camera.pixel_angle
     weight = reference.weight.double()

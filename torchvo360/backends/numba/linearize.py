@@ -1,8 +1,9 @@
 """`linearize` on the compiled pass: tensors to arrays, and sums to normal equations."""
 
+import functools
 import importlib
 import math
-from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 import torch
@@ -60,11 +61,31 @@ def linearize(
             "linearize: expected float32 tensors on the CPU without gradients, and a panorama or a pinhole, for numba, "
             "got others."
         )
+    arguments = as_arrays(reference, target, T_tgt_ref, affine, loss, noise)
+    sums = kernel("pairs").sum_pairs(*arguments, torch.get_num_threads())
+    M = torch.from_numpy(sums[:, UPPER])
+    cost, weight = torch.from_numpy(sums[:, 45:].copy()).unbind(1)
+    return NormalEquations(M[:, :8, :8], M[:, :8, 8], cost, weight, M[:, 8, 8])
+
+
+def as_arrays(
+    reference: Reference,
+    target: Target,
+    T_tgt_ref: Float[Tensor, "B 4 4"],
+    affine: Float[Tensor, "B 2"],
+    loss: LossConfig,
+    noise: float,
+) -> tuple[Any, ...]:
+    """Return what `linearize` takes as the arguments of `kernels.pairs.sum_pairs`, but for the number of threads.
+
+    Raises:
+        ShapeError: Shapes do not belong together.
+    """
     _check_shapes(reference, target, T_tgt_ref, affine)
     points = tuple(_array(x) for x in (reference.ray, reference.rho, reference.value, reference.weight))
     variance = NOTHING[0] if reference.variance is None else _array(reference.variance)
     confidence = NOTHING[1] if target.confidence is None else _array(target.confidence)
-    sums = _kernel()(
+    return (
         (*points, variance),
         (_array(target.padded), confidence),
         T_tgt_ref.detach().double().contiguous().numpy(),
@@ -72,11 +93,7 @@ def linearize(
         _intrinsics(target),
         _optics(target),
         _loss(loss, target.saturation, noise),
-        torch.get_num_threads(),
     )
-    M = torch.from_numpy(sums[:, UPPER])
-    cost, weight = torch.from_numpy(sums[:, 45:].copy()).unbind(1)
-    return NormalEquations(M[:, :8, :8], M[:, :8, 8], cost, weight, M[:, 8, 8])
 
 
 def _array(value: Tensor) -> np.ndarray:
@@ -102,13 +119,18 @@ def _optics(target: Target) -> tuple[int, bool, bool, np.float32]:
 
 
 def _loss(loss: LossConfig, saturation: float | None, noise: float) -> tuple[int | np.float32, ...]:
-    cutoff, most = math.inf, math.inf
-    if loss.cutoff is not None:
-        cutoff = loss.cutoff
-        most = float(robust(torch.tensor(cutoff), loss)[1])
-    clipped = math.inf if saturation is None else saturation
-    numbers = (loss.scale, loss.degrees_of_freedom, cutoff, most, clipped, noise)
-    return (LOSSES.index(loss.name), *(np.float32(number) for number in numbers))
+    kind, *numbers = _robust(loss.name, loss.scale, loss.degrees_of_freedom, loss.cutoff)
+    return (kind, *numbers, np.float32(math.inf if saturation is None else saturation), np.float32(noise))
+
+
+@functools.lru_cache
+def _robust(name: str, scale: float, freedom: float, cutoff: float | None) -> tuple[int | np.float32, ...]:
+    """Return a loss by its number, scale, degrees of freedom, cut-off and the cost there."""
+    end, most = math.inf, math.inf
+    if cutoff is not None:
+        loss = LossConfig(name=name, scale=scale, degrees_of_freedom=freedom, cutoff=cutoff)
+        end, most = cutoff, float(robust(torch.tensor(cutoff), loss)[1])
+    return (LOSSES.index(name), *(np.float32(number) for number in (scale, freedom, end, most)))
 
 
 def _check_shapes(reference: Reference, target: Target, T_tgt_ref: Tensor, affine: Tensor) -> None:
@@ -135,10 +157,10 @@ def _check_shapes(reference: Reference, target: Target, T_tgt_ref: Tensor, affin
         raise ShapeError(f"affine: expected shape {[B, 2]}, got {list(affine.shape)}.")
 
 
-def _kernel() -> Callable[..., np.ndarray]:
-    """Import what numba has compiled: half a second, and some more the first time of all."""
+def kernel(name: str) -> Any:
+    """Import a module of what numba has compiled: half a second, and some more the first time of all."""
     try:
-        return importlib.import_module("torchvo360.backends.numba.kernels.pairs").sum_pairs
+        return importlib.import_module(f"torchvo360.backends.numba.kernels.{name}")
     except ModuleNotFoundError as error:
         if error.name != "numba":
             raise

@@ -1,0 +1,307 @@
+"""Levenberg-Marquardt of pairs in one call: what `solve.minimize` does with the direct alignment, on arrays.
+
+A step is proposed, its candidate linearised and judged, for every pair by itself: `solve.step`, `solve.damping` and
+`solve.lm` tell why. On one thread a pair is solved to its end before the next begins; on several all go in step, and
+the parts of those that have not ended are handed out together. Either way a pair gets the same bits.
+"""
+
+import math
+
+import numpy as np
+from numba import get_num_threads, set_num_threads
+
+from torchvo360.backends.numba.kernels.jit import FAST, compiled
+from torchvo360.backends.numba.kernels.pairs import PART, SUMS, element, sum_in_threads, sum_part
+from torchvo360.backends.numba.kernels.rigid import multiply, se3_exp, se3_log, times_inverse
+from torchvo360.backends.numba.kernels.scratch import BLOCK, SCRATCH, f4
+from torchvo360.backends.numba.kernels.symmetric import solve_ldl
+
+# A pair's normal equations in one row: H row by row, g, cost, weight and square.
+G, COST, WEIGHT, SQUARE = 64, 72, 73, 74
+EQUATIONS = 75
+
+# What becomes of a proposed step.
+TO_JUDGE, UNSOLVABLE, ARRIVED = 0, 1, 2
+
+
+@compiled(fastmath=FAST)
+def weigh_ranges(rho, weight):
+    """Return the sums of weights, and of weights times inverse ranges."""
+    total, near = 0.0, 0.0
+    for i in range(len(rho)):
+        w = np.float64(weight[i])
+        total += w
+        near += w * np.float64(rho[i])
+    return total, near
+
+
+@compiled()
+def find_scale(points, per_radian, scale):
+    """Write each pair's factors from steps of (v, w, a, b) to comparable units: of v by the mean inverse range."""
+    rho, weight = points[1], points[3]
+    for b in range(len(scale)):
+        if b == 0 or rho.shape[0] > 1 or weight.shape[0] > 1:
+            total, near = weigh_ranges(element(rho, b), element(weight, b))
+            by_v = near / max(total, 1e-12) * per_radian
+        else:
+            by_v = scale[0, 0]
+        scale[b, :3], scale[b, 3:6], scale[b, 6:] = by_v, per_radian, 1.0
+
+
+@compiled()
+def add_up(sums, b, T, prior, row):
+    """Write normal equations: the sums of a pair's parts in their order, and the prior's, to first order."""
+    total = np.zeros(SUMS)
+    for part in range(len(sums)):
+        total += sums[part]
+    m = 0
+    for p in range(8):
+        for q in range(p, 8):
+            row[p * 8 + q] = row[q * 8 + p] = total[m]
+            m += 1
+        row[G + p] = total[m]
+        m += 1
+    row[SQUARE], row[COST], row[WEIGHT] = total[44], total[45], total[46]
+    T_prior, information = prior
+    if information.size:
+        known = element(information, b)
+        d = se3_log(times_inverse(T, element(T_prior, b)))
+        for p in range(6):
+            pull = 0.0
+            for q in range(6):
+                pull += known[p, q] * d[q]
+                row[p * 8 + q] += known[p, q]
+            row[G + p] += pull
+            row[COST] += 0.5 * d[p] * pull
+
+
+@compiled()
+def begin(b, state, rules, outcomes):
+    """Judge a pair's start; return whether it goes on."""
+    _, _, equations, damping, status, steps = state
+    row = equations[b]
+    finite = math.isfinite(row[COST])
+    for p in range(8):
+        finite = finite and math.isfinite(row[G + p])
+    going_on, _, _, _, _, too_few, diverged = outcomes
+    status[b] = (going_on if finite else diverged) if row[WEIGHT] >= rules[7] else too_few
+    damping[b, 0], damping[b, 1] = rules[2], 2.0
+    steps[b] = 0
+    return status[b] == going_on
+
+
+@compiled()
+def retract(T, affine, delta, T_new, affine_new, farthest, most_gain):
+    """Apply a step (v, w, a, b) to a pose and brightness; write them as they were where it leads nowhere sensible."""
+    multiply(se3_exp(delta[:6]), T, T_new)
+    affine_new[0], affine_new[1] = affine[0] + delta[6], affine[1] + delta[7]
+    sensible = abs(affine_new[0]) < most_gain and math.isfinite(affine_new[1])
+    for i in range(3):
+        sensible = sensible and abs(T_new[i, 3]) < farthest
+        for j in range(3):
+            sensible = sensible and math.isfinite(T_new[i, j])
+    if not sensible:
+        T_new[:] = T
+        affine_new[:] = affine
+
+
+@compiled()
+def propose(b, state, candidate, scale, free, rules):
+    """Take the damped Gauss-Newton step of a pair; return TO_JUDGE, UNSOLVABLE or ARRIVED."""
+    T, affine, equations, damping, _, steps = state
+    T_new, affine_new, _, delta = candidate
+    _, _, _, _, step_tolerance, _, _, _, farthest, most_gain, pivot = rules
+    steps[b] += 1
+    A, x, row = np.empty((8, 8)), delta[b], equations[b]
+    for p in range(8):
+        for q in range(p + 1):
+            A[p, q] = row[p * 8 + q] / row[WEIGHT] * (free[p] * free[q])
+        A[p, p] += 1.0 - free[p]
+        A[p, p] += damping[b, 0] * A[p, p]
+        x[p] = -row[G + p] / row[WEIGHT] * free[p]
+    if not solve_ldl(A, x, pivot):
+        return UNSOLVABLE
+    retract(T[b], affine[b], x, T_new[b], affine_new[b], farthest, most_gain)
+    length2 = 0.0
+    for p in range(8):
+        length2 += (x[p] * scale[b, p]) ** 2
+    return ARRIVED if math.sqrt(length2) < step_tolerance and damping[b, 0] <= 1.0 else TO_JUDGE
+
+
+@compiled()
+def promised_fall(row, delta, free):
+    """Return by how much the linear model said the mean cost would fall."""
+    fall = 0.0
+    for p in range(8):
+        slope = row[G + p]
+        for q in range(8):
+            slope += 0.5 * row[p * 8 + q] * (delta[q] * free[q])
+        fall -= delta[p] * free[p] * slope
+    return fall / row[WEIGHT]
+
+
+@compiled()
+def next_damping(value, growth, accepted, gain, by_gain):
+    """Return the damping and its growth after a step, by Nielsen's rule or by LSD-SLAM's."""
+    if not accepted:
+        return 0.2 if value == 0.0 else value * growth, growth * 2.0
+    if by_gain:
+        shrink = max(1.0 - (2.0 * min(max(gain, 0.0), 1.0) - 1.0) ** 3, 1.0 / 3.0)
+        return max(value * shrink, 1e-9), 2.0
+    return 0.0 if value <= 0.2 else value / 2.0, 2.0
+
+
+@compiled()
+def judge(b, solvable, state, candidate, free, rules, outcomes):
+    """Accept or refuse a pair's step, of which a solvable one has been evaluated; return whether the pair goes on."""
+    T, affine, equations, damping, status, steps = state
+    T_new, affine_new, proposed, delta = candidate
+    max_steps, by_gain, _, max_damping, _, cost_tolerance, least, min_weight, _, _, _ = rules
+    going_on, converged, out_of_steps, stalled, singular, _, _ = outcomes
+    row, value = equations[b], damping[b, 0]
+    accepted, gained, promised = False, 0.0, 0.0
+    outcome = out_of_steps if steps[b] >= max_steps else going_on
+    if solvable:
+        cost = row[COST] / row[WEIGHT]
+        new_cost = proposed[b, COST] / max(proposed[b, WEIGHT], min_weight)
+        promised, gained = promised_fall(row, delta[b], free), cost - new_cost
+        accepted = math.isfinite(new_cost) and proposed[b, WEIGHT] >= min_weight and gained > 0.0
+        little = gained <= cost_tolerance * cost if accepted else promised <= least * cost
+        arrived = little and (accepted or promised >= 0.0) and value <= 1.0
+    else:
+        arrived = False
+    if not accepted and value >= max_damping:
+        outcome = stalled
+    if not solvable and value >= 1.0:
+        outcome = singular
+    if arrived:
+        outcome = converged
+    gain = gained / max(promised, 2.2250738585072014e-308)
+    damping[b, 0], damping[b, 1] = next_damping(value, damping[b, 1], accepted, gain, by_gain)
+    if accepted:
+        T[b], affine[b], equations[b] = T_new[b], affine_new[b], proposed[b]
+    status[b] = outcome
+    return outcome == going_on
+
+
+@compiled()
+def find_candidate(b, state, candidate, scale, free, rules, outcomes):
+    """Propose steps of a pair until one is to be evaluated; return False where the pair has ended before."""
+    while True:
+        proposed = propose(b, state, candidate, scale, free, rules)
+        if proposed == TO_JUDGE:
+            return True
+        if proposed == ARRIVED:
+            # So short a step is taken without being evaluated.
+            state[0][b], state[1][b], state[4][b] = candidate[0][b], candidate[1][b], outcomes[1]
+            return False
+        if not judge(b, False, state, candidate, free, rules, outcomes):
+            return False
+
+
+@compiled()
+def go_on(b, first, sums, prior, state, candidate, scale, free, rules, outcomes):
+    """Judge what has been evaluated, the start first of all; return whether a further candidate is to be evaluated."""
+    add_up(sums, b, candidate[0][b], prior, candidate[2][b])
+    if first:
+        state[2][b] = candidate[2][b]
+        going = begin(b, state, rules, outcomes)
+    else:
+        going = judge(b, True, state, candidate, free, rules, outcomes)
+    return going and find_candidate(b, state, candidate, scale, free, rules, outcomes)
+
+
+@compiled(nogil=True)
+def _one_by_one(points, images, k, optics, loss, prior, per_radian, state, candidate, free, rules, outcomes):
+    """Solve pair after pair."""
+    T, affine = candidate[0], candidate[1]
+    B, N = len(T), points[1].shape[1]
+    s, index = np.empty(SCRATCH, f4), np.empty(BLOCK, np.uint32)
+    scale, sums = np.empty((B, 8)), np.empty((max((N + PART - 1) // PART, 1), SUMS))
+    find_scale(points, per_radian, scale)
+    for b in range(B):
+        going, first = True, True
+        while going:
+            for part in range(len(sums)):
+                last = min((part + 1) * PART, N)
+                sum_part(s, index, b, part * PART, last, points, images, T, affine, k, optics, loss, sums[part])
+            going = go_on(b, first, sums, prior, state, candidate, scale, free, rules, outcomes)
+            first = False
+
+
+@compiled(nogil=True)
+def _in_step(workers, points, images, k, optics, loss, prior, per_radian, state, candidate, free, rules, outcomes):
+    """Evaluate all pairs that have not ended together, in threads, step by step."""
+    T, affine = candidate[0], candidate[1]
+    B, parts = len(T), max((points[1].shape[1] + PART - 1) // PART, 1)
+    scale, sums, places = np.empty((B, 8)), np.empty((B * parts, SUMS)), np.arange(B)
+    find_scale(points, per_radian, scale)
+    count, first = B, True
+    while count:
+        tasks = count * parts
+        workers = min(workers, tasks)
+        sum_in_threads(workers, parts, places[:count], points, images, T, affine, k, optics, loss, sums[:tasks])
+        left = 0
+        for at in range(count):
+            b = places[at]
+            own = sums[at * parts : (at + 1) * parts]
+            if go_on(b, first, own, prior, state, candidate, scale, free, rules, outcomes):
+                places[left] = b
+                left += 1
+        count, first = left, False
+
+
+def solve_pairs(
+    points: tuple[np.ndarray, ...],
+    images: tuple[np.ndarray, np.ndarray],
+    T: np.ndarray,
+    affine: np.ndarray,
+    k: np.ndarray,
+    optics: tuple[int, bool, bool, np.float32],
+    loss: tuple[int | np.float32, ...],
+    prior: tuple[np.ndarray, np.ndarray],
+    per_radian: float,
+    free: np.ndarray,
+    rules: tuple[int | float | bool, ...],
+    outcomes: tuple[int, ...],
+    threads: int,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Solve every pair from its own start. Nothing is checked: wrong shapes read foreign memory.
+
+    Args:
+        points: As in `pairs.sum_pairs`, as are the images, k, the optics and the loss.
+        images: Likewise.
+        T: Starts [B, 4, 4], float64.
+        affine: (a, b) to start from [B, 2], float64.
+        k: Intrinsics.
+        optics: The camera.
+        loss: The robust loss.
+        prior: Poses [B, 4, 4] and their information [B, 6, 6], float64, with a batch axis of B or of 1; or empty.
+        per_radian: Pixels to a radian: the unit of a rotation's steps.
+        free: 1 for parameters that are estimated, 0 for others [8], float64.
+        rules: Most steps; whether damping follows the gain ratio; damping to start from; most damping; tolerance of
+            steps; of costs; least share of the cost that a refused step must have promised; least weight; farthest
+            position; most log gain; least pivot.
+        outcomes: Codes of going on, converged, out of steps, stalled, singular, too few pixels, diverged.
+        threads: How many to use at most; no more than numba is allowed.
+
+    Returns:
+        T [B, 4, 4], (a, b) [B, 2], normal equations [B, EQUATIONS], status [B] and steps [B].
+    """
+    B, parts = len(T), max(-(-points[1].shape[1] // PART), 1)
+    status, steps = np.zeros(B, np.int64), np.zeros(B, np.int64)
+    equations, proposed = np.empty((2, B, EQUATIONS))
+    state = T.copy(), affine.copy(), equations, np.empty((B, 2)), status, steps
+    candidate = T.copy(), affine.copy(), proposed, np.empty((B, 8))
+    arguments = points, images, k, optics, loss, prior, per_radian, state, candidate, free, rules, outcomes
+    workers = min(threads, B * parts)
+    if workers <= 1:
+        _one_by_one(*arguments)
+    else:
+        before = get_num_threads()
+        set_num_threads(min(workers, before))
+        try:
+            _in_step(workers, *arguments)
+        finally:
+            set_num_threads(before)
+    return state[0], state[1], equations, status, steps

@@ -7,7 +7,7 @@ import torch
 
 from torchvo360.residuals.direct import Target
 from torchvo360.window.config import WindowConfig
-from torchvo360.window.energy import linearize_window
+from torchvo360.window.energy import linearize_points
 from torchvo360.window.points import WindowPoints
 from torchvo360.window.state import Estimate
 from torchvo360.window.stereo import Other
@@ -35,13 +35,13 @@ def settle_points(
         steps: How many steps.
     """
     damping = torch.full_like(points.rho, START_DAMPING)
-    system = linearize_window(targets, points, estimate, config, others=others)
+    system = linearize_points(targets, points, estimate, config, others=others)
     for _ in range(steps):
         rho = estimate.rho
         limit = 0.3 * rho.clamp_min(0.05 * float(rho.median()) if len(rho) else 0.0)
         move = -system.slope.to(rho) / (system.curvature.to(rho) * (1 + damping) + LEAST_CURVATURE)
         proposed = estimate._replace(rho=(rho + torch.clamp(move, -limit, limit)).clamp_min(0))
-        there = linearize_window(targets, points, proposed, config, thresholds=system.thresholds, others=others)
+        there = linearize_points(targets, points, proposed, config, thresholds=system.thresholds, others=others)
         better = there.by_point < system.by_point
         estimate = estimate._replace(rho=torch.where(better, proposed.rho, rho))
         damping = torch.where(better, damping * 0.3, damping * 10)

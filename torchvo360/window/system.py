@@ -14,6 +14,23 @@ LEAST_CURVATURE = 1e-9
 """Added to every unknown's curvature, so that there is an inverse."""
 
 
+class PointSystem(NamedTuple):
+    """Normal equations of the points, with keyframes where they are."""
+
+    curvature: Float64[Tensor, "N"]
+    """Second derivatives by rho."""
+    slope: Float64[Tensor, "N"]
+    """First derivatives by rho."""
+    by_point: Float64[Tensor, "N"]
+    """Each point's share of the energy, its prior included."""
+    inliers: Float[Tensor, "N"]
+    """Images that see the point within their threshold."""
+    edges: int
+    """How many edges there were."""
+    thresholds: Float[Tensor, "K+S"]
+    """Of the keyframes, then of the further images."""
+
+
 class WindowSystem(NamedTuple):
     """Normal equations of all unknowns, and what the energy was made of.
 

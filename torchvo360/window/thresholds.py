@@ -41,11 +41,12 @@ def judge(
     total = weight.sum(1)
     mean = (cost * weight).sum(1) / total.clamp_min(1e-6)
     seen = total > LEAST_WEIGHT * own_weight.clamp_min(1e-6)
-    limit = _quantile(mean[seen], config) if threshold is None else threshold
+    limit = find_threshold(mean[seen], config) if threshold is None else threshold
     return Judged(seen, seen & (mean < limit), torch.minimum(mean, limit) * total * seen, limit)
 
 
-def _quantile(mean: Float[Tensor, "n"], config: WindowConfig) -> Tensor:
+def find_threshold(mean: Float[Tensor, "n"], config: WindowConfig) -> Float[Tensor, ""]:
+    """Return an image's outlier threshold by a quantile of the mean energies of the points that it sees."""
     least = mean.new_tensor(config.min_threshold)
     if len(mean) == 0:
         return least

@@ -10,8 +10,8 @@ from torch import Tensor
 from torchvo360 import lie
 from torchvo360.checks import InputError
 from torchvo360.residuals.inertial import Preintegrated
-from torchvo360.solve.schur import reduce
 from torchvo360.window.calibration import at_intrinsics, intrinsics_of, unit_rays
+from torchvo360.window.compiled import reduce
 from torchvo360.window.equations import GAUGE_WEIGHT, WindowEquations
 from torchvo360.window.inertial import Coupling, linearize_coupling
 from torchvo360.window.layout import Layout
@@ -193,9 +193,9 @@ class Window(WindowEquations):
         if gone.thresholds is not None and len(known) == len(self.frames):
             thresholds = torch.cat([torch.stack([each[0] for each in known]), gone.thresholds[1:]])
         system = self.linearize_images(own, estimate, thresholds, others)
-        used = system.inliers > 0
-        diagonal = torch.where(used, system.curvature + LEAST_CURVATURE, 1.0)
-        A, b = reduce(system.H, system.g, system.cross * used[:, None], diagonal, system.slope * used)
+        # A curvature without end leaves a point out.
+        diagonal = torch.where(system.inliers > 0, system.curvature + LEAST_CURVATURE, torch.inf)
+        A, b = reduce(system.H, system.g, system.cross, diagonal, system.slope)
         d = difference(self.frames, estimate, self.first)
         H, g = self.prior.H.clone(), self.prior.g + self.prior.H @ d
         images = slice(0, self.layout.visual)

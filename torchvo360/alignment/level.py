@@ -14,8 +14,8 @@ from torch import Tensor
 from torchvo360 import lie
 from torchvo360.alignment import compiled
 from torchvo360.alignment.config import AlignConfig
-from torchvo360.backends import linearize
-from torchvo360.residuals.direct import Reference, Target, look_up
+from torchvo360.backends import compare, linearize
+from torchvo360.residuals.direct import Reference, Target
 from torchvo360.residuals.normal import NormalEquations
 from torchvo360.solve import Problem, Solution, minimize
 
@@ -38,9 +38,8 @@ def match_brightness(reference: Reference, target: Target, T_tgt_ref: Float[Tens
         target: Images.
         T_tgt_ref: Starts.
     """
-    dtype = reference.value.dtype
-    samples = look_up(reference, target, T_tgt_ref.to(dtype), reference.rho.new_zeros(len(T_tgt_ref), 2))
-    weight = samples.weight.double().mean(1)
+    met = compare(reference, target, T_tgt_ref, T_tgt_ref.new_zeros(len(T_tgt_ref), 2))
+    weight = met.weight.double().mean(1)
     # A few heavy pixels say where to align, not how bright the images are.
     weight = torch.minimum(weight, weight.mean(1, keepdim=True))
     total = weight.sum(1).clamp_min(1e-12)
@@ -52,8 +51,8 @@ def match_brightness(reference: Reference, target: Target, T_tgt_ref: Float[Tens
         # The floor keeps the root's slope finite where an image has no contrast.
         return mean, (variance + 1e-16).sqrt()
 
-    mean_tgt, spread_tgt = moments(samples.residual + samples.gained)
-    mean_ref, spread_ref = moments(samples.gained)
+    mean_tgt, spread_tgt = moments(met.value)
+    mean_ref, spread_ref = moments(reference.value)
     a = ((spread_tgt + 1e-4) / (spread_ref + 1e-4)).log().clamp(-math.log(5), math.log(5))
     return torch.stack([a, mean_tgt - a.exp() * mean_ref], -1)
 

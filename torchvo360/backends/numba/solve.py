@@ -99,4 +99,10 @@ def solve_pairs(
     equations = NormalEquations(
         numbers[:, :64].view(-1, 8, 8), numbers[:, 64:72], numbers[:, 72], numbers[:, 73], numbers[:, 74]
     )
-    return Solved(*map(torch.from_numpy, (T, ab)), equations, *map(torch.from_numpy, (status, steps)))
+    return Solved(
+        torch.from_numpy(T),
+        torch.from_numpy(ab),
+        equations,
+        torch.from_numpy(status),
+        torch.from_numpy(steps),
+    )

@@ -45,15 +45,20 @@ def find_scale(points, per_radian, scale):
             by_v = near / max(total, 1e-12) * per_radian
         else:
             by_v = scale[0, 0]
-        scale[b, :3], scale[b, 3:6], scale[b, 6:] = by_v, per_radian, 1.0
+        for p in range(8):
+            scale[b, p] = by_v if p < 3 else (per_radian if p < 6 else 1.0)
 
 
 @compiled()
 def add_up(sums, b, T, prior, row):
-    """Write normal equations: the sums of a pair's parts in their order, and the prior's, to first order."""
-    total = np.zeros(SUMS)
-    for part in range(len(sums)):
-        total += sums[part]
+    """Write normal equations: the sums of a pair's parts in their order, and the prior's, to first order.
+
+    The first part's sums are overwritten.
+    """
+    total = sums[0]
+    for part in range(1, len(sums)):
+        for m in range(SUMS):
+            total[m] += sums[part, m]
     m = 0
     for p in range(8):
         for q in range(p, 8):
@@ -91,6 +96,15 @@ def begin(b, state, rules, outcomes):
 
 
 @compiled()
+def copy_motion(T, affine, T_out, affine_out):
+    """Copy a pose and brightness, by loops: numba compiles assignments of whole arrays for seconds."""
+    for i in range(4):
+        for j in range(4):
+            T_out[i, j] = T[i, j]
+    affine_out[0], affine_out[1] = affine[0], affine[1]
+
+
+@compiled()
 def retract(T, affine, delta, T_new, affine_new, farthest, most_gain):
     """Apply a step (v, w, a, b) to a pose and brightness; write them as they were where it leads nowhere sensible."""
     multiply(se3_exp(delta[:6]), T, T_new)
@@ -101,8 +115,7 @@ def retract(T, affine, delta, T_new, affine_new, farthest, most_gain):
         for j in range(3):
             sensible = sensible and math.isfinite(T_new[i, j])
     if not sensible:
-        T_new[:] = T
-        affine_new[:] = affine
+        copy_motion(T, affine, T_new, affine_new)
 
 
 @compiled()
@@ -179,7 +192,9 @@ def judge(b, solvable, state, candidate, free, rules, outcomes):
     gain = gained / max(promised, 2.2250738585072014e-308)
     damping[b, 0], damping[b, 1] = next_damping(value, damping[b, 1], accepted, gain, by_gain)
     if accepted:
-        T[b], affine[b], equations[b] = T_new[b], affine_new[b], proposed[b]
+        copy_motion(T_new[b], affine_new[b], T[b], affine[b])
+        for m in range(EQUATIONS):
+            row[m] = proposed[b, m]
     status[b] = outcome
     return outcome == going_on
 
@@ -193,9 +208,10 @@ def find_candidate(b, state, candidate, scale, free, rules, outcomes):
             return True
         if proposed == ARRIVED:
             # So short a step is taken without being evaluated.
-            state[0][b], state[1][b], state[4][b] = candidate[0][b], candidate[1][b], outcomes[1]
+            copy_motion(candidate[0][b], candidate[1][b], state[0][b], state[1][b])
+            state[4][b] = outcomes[1]
             return False
-        if not judge(b, False, state, candidate, free, rules, outcomes):
+        if not judge(b, proposed == TO_JUDGE, state, candidate, free, rules, outcomes):
             return False
 
 
@@ -204,10 +220,11 @@ def go_on(b, first, sums, prior, state, candidate, scale, free, rules, outcomes)
     """Judge what has been evaluated, the start first of all; return whether a further candidate is to be evaluated."""
     add_up(sums, b, candidate[0][b], prior, candidate[2][b])
     if first:
-        state[2][b] = candidate[2][b]
+        for m in range(EQUATIONS):
+            state[2][b, m] = candidate[2][b, m]
         going = begin(b, state, rules, outcomes)
     else:
-        going = judge(b, True, state, candidate, free, rules, outcomes)
+        going = judge(b, not first, state, candidate, free, rules, outcomes)
     return going and find_candidate(b, state, candidate, scale, free, rules, outcomes)
 
 

@@ -27,6 +27,16 @@ def rodrigues(angle2):
 
 
 @compiled()
+def identity():
+    """Return the identity [4, 4]."""
+    M = np.empty((4, 4))
+    for i in range(4):
+        for j in range(4):
+            M[i, j] = 1.0 if i == j else 0.0
+    return M
+
+
+@compiled()
 def add_skew(w, skew, square, M):
     """Add `skew * hat(w) + square * hat(w)^2` to the upper left 3 x 3 of M."""
     x, y, z = w[0], w[1], w[2]
@@ -46,7 +56,7 @@ def se3_exp(xi):
     """Return the rigid motion [4, 4] of a tangent (v, w)."""
     w = xi[3:6]
     a, b, c = rodrigues(w[0] * w[0] + w[1] * w[1] + w[2] * w[2])
-    T, V = np.eye(4), np.eye(3)
+    T, V = identity(), identity()
     add_skew(w, a, b, T)
     add_skew(w, b, c, V)
     for i in range(3):
@@ -59,19 +69,18 @@ def so3_log(R, w):
     """Write the rotation vector of R, of length at most pi."""
     # Of Shepperd's four solutions the one with the largest divisor.
     trace = R[0, 0] + R[1, 1] + R[2, 2]
-    best, most = 3, trace
-    for i in range(3):
-        if R[i, i] > most:
-            best, most = i, R[i, i]
+    i = 0 if R[0, 0] >= R[1, 1] else 1
+    i = i if R[i, i] >= R[2, 2] else 2
     q = np.empty(4)
-    if best == 3:
+    if trace >= R[i, i]:
         q[0], q[1], q[2], q[3] = R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1], 1.0 + trace
     else:
-        i, j, k = best, (best + 1) % 3, (best + 2) % 3
+        j, k = (i + 1) % 3, (i + 2) % 3
         q[i] = 1.0 + R[i, i] - R[j, j] - R[k, k]
         q[j], q[k], q[3] = R[i, j] + R[j, i], R[i, k] + R[k, i], R[k, j] - R[j, k]
     if q[3] < 0.0:
-        q = -q
+        for i in range(4):
+            q[i] = -q[i]
     n = math.sqrt(q[0] * q[0] + q[1] * q[1] + q[2] * q[2])
     # atan(n / w) / n, whose limit is 1 / w
     factor = 2.0 * math.atan2(n, q[3]) / n if n > 1e-9 * q[3] else 2.0 / q[3]
@@ -91,7 +100,7 @@ def se3_log(T):
         square = 1.0 / 12.0 + angle2 * (1.0 / 720.0 + angle2 * (1.0 / 30240.0 + angle2 / 1209600.0))
     else:
         square = (1.0 - half * math.cos(half) / math.sin(half)) / angle2
-    inverse = np.eye(3)  # of the left Jacobian
+    inverse = identity()  # of the left Jacobian
     add_skew(w, -0.5, square, inverse)
     for i in range(3):
         xi[i] = inverse[i, 0] * T[0, 3] + inverse[i, 1] * T[1, 3] + inverse[i, 2] * T[2, 3]
@@ -109,7 +118,7 @@ def multiply(A, B, out):
 @compiled()
 def times_inverse(A, B):
     """Return `A B^-1` of rigid motions."""
-    inverse, out = np.eye(4), np.empty((4, 4))
+    inverse, out = identity(), np.empty((4, 4))
     for i in range(3):
         for j in range(3):
             inverse[i, j] = B[j, i]

@@ -44,7 +44,8 @@ def solve_ldl(A, x, tolerance):
         for j in range(i):
             x[i] -= A[i, j] * x[j]
     if not ok:
-        x[:] = 0.0
+        for i in range(D):
+            x[i] = 0.0
         return False
     for i in range(D - 1, -1, -1):
         x[i] /= A[i, i]

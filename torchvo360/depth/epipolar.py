@@ -5,17 +5,21 @@ the camera), at the angle theta with tan(theta) = rho |t| sin(phi) / (1 + rho |t
 between the two ends (mathematics.md, section 5). The search runs in steps of one pixel of arc around the predicted
 angle, compares five samples spaced along the curve, refines the best by a parabola, and says how sure the result is
 (LSD-SLAM, Engel et al. 2013: geometric and photometric error of a disparity).
+
+It is a compiled pass over the points where numba serves (`backends.numba`), and eager torch elsewhere.
 """
 
 from dataclasses import dataclass
 from typing import NamedTuple
 
+import numpy as np
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from torchvo360.backends.numba.images import can_see, image_view, look_up_usable, plain
 from torchvo360.checks import InputError, check_finite_number
-from torchvo360.residuals.direct import Target, look_up_usable
+from torchvo360.residuals.direct import Target
 
 HALF_PATTERN = 2
 """Samples on each side of the centre: 5 in all (S2, section 4.1)."""
@@ -136,6 +140,8 @@ def search_great_circles(
         affine: The known brightness change (a, b).
         config: Settings.
     """
+    if can_see(reference, target, also=(ray, rho, variance, slope)):
+        return _search_compiled(reference, target, (ray, rho, variance, slope), T_tgt_ref, affine, config)
     step = target.camera.pixel_angle
     T, affine = T_tgt_ref.to(ray), affine.to(ray)
     circles = great_circles(ray, T)
@@ -175,6 +181,30 @@ def search_great_circles(
     return EpipolarMatch(out_rho, out_variance, searched, found)
 
 
+def _search_compiled(
+    reference: Target,
+    target: Target,
+    points: tuple[Tensor, ...],
+    T_tgt_ref: Float[Tensor, "4 4"],
+    affine: Float[Tensor, "2"],
+    config: EpipolarConfig,
+) -> EpipolarMatch:
+    from torchvo360.backends.numba.kernels.epipolar import search
+
+    rho, variance = (torch.empty_like(points[1]) for _ in range(2))
+    searched, found = (torch.empty_like(rho, dtype=torch.bool) for _ in range(2))
+    limits = (config.min_gradient, config.min_sine, config.max_half_width_px, config.max_ssd, config.min_distinction)
+    search(
+        *(plain(part) for part in (*points, T_tgt_ref.double(), affine.double())),
+        image_view(reference),
+        image_view(target),
+        target.camera.pixel_angle,
+        np.array([*limits, config.noise, config.position_error_px, config.line_error_px]),
+        *(part.numpy() for part in (rho, variance, searched, found)),
+    )
+    return EpipolarMatch(rho, variance, searched, found)
+
+
 def reference_samples(
     reference: Target, ray: Float[Tensor, "3 N"], circles: GreatCircles, T: Float[Tensor, "4 4"], step: float
 ) -> Float[Tensor, "N 5"]:
@@ -204,7 +234,7 @@ def _search(
     ssd = (window - samples[:, None]).square().sum(-1).nan_to_num(nan=torch.inf)
     centre = theta[:, HALF_PATTERN:-HALF_PATTERN]
     inside = (
-        ((centre - middle[:, None]).abs() <= (half_width[:, None] + 0.5) * step)
+        (offsets[HALF_PATTERN:-HALF_PATTERN].abs() <= half_width[:, None] + 0.5)
         & (centre > -1.5 * step)
         & (centre < circles.phi[:, None] - 0.02)
     )

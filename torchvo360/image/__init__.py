@@ -4,15 +4,24 @@ from torchvo360.image.covector import covector_field, gradient, gradient_magnitu
 from torchvo360.image.padding import pad_image
 from torchvo360.image.pyramid import blur, blur_radius, level_camera, masked_pyramid, pyramid, resample
 from torchvo360.image.sampling import Interpolated, Taps, interpolate, locate, sample
-from torchvo360.image.selection import equal_area_cells, one_per_cell, select_about, select_pixels
+from torchvo360.image.selection import (
+    cell_of,
+    equal_area_cells,
+    equal_area_rows,
+    one_per_cell,
+    select_about,
+    select_pixels,
+)
 
 __all__ = [
     "Interpolated",
     "Taps",
     "blur",
     "blur_radius",
+    "cell_of",
     "covector_field",
     "equal_area_cells",
+    "equal_area_rows",
     "gradient",
     "gradient_magnitude",
     "interpolate",

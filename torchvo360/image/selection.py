@@ -1,6 +1,7 @@
 """Selection of pixels that are spread evenly over the sphere and carry gradient."""
 
 import math
+from collections.abc import Callable
 
 import torch
 from jaxtyping import Bool, Float, Int64
@@ -10,14 +11,19 @@ from torchvo360.cameras import Camera
 from torchvo360.checks import check_shape
 
 
-def equal_area_cells(camera: Camera, count: int, *, device: torch.device | str = "cpu") -> Int64[Tensor, "H W"]:
-    """Number the pixels' cells: about `count` cells of nearly equal solid angle over the image.
+def equal_area_rows(
+    camera: Camera, count: int, *, device: torch.device | str = "cpu"
+) -> tuple[Int64[Tensor, "H"], Int64[Tensor, "H"]]:
+    """Divide every row into cells of equal width, about `count` cells of nearly equal solid angle over the image.
 
     A full panorama is cut into bands of latitude, and each band into as many cells as its circumference asks for.
     Other cameras are cut into squares of the image, whose solid angle varies little.
+
+    Returns:
+        first: Number of each row's first cell.
+        cells: How many there are in it; pixel u lies in the cell `first + u * cells // width`.
     """
     rows = torch.arange(camera.height, device=device)
-    columns = torch.arange(camera.width, device=device)
     if camera.wraps:
         side = math.sqrt(4 * math.pi / count)
         bands = max(1, round(math.pi / side))
@@ -25,11 +31,25 @@ def equal_area_cells(camera: Camera, count: int, *, device: torch.device | str =
         middle = (torch.arange(bands, dtype=torch.float64, device=device) + 0.5) / bands * math.pi
         cells = (math.tau * middle.sin() / side).round().long().clamp_min(1)
         first = torch.cat([cells.new_zeros(1), cells.cumsum(0)])
-        return first[band][:, None] + (columns * cells[band][:, None]) // camera.width
+        return first[band], cells[band]
     side_px = math.sqrt(camera.width * camera.height / count)
     across = max(1, round(camera.width / side_px))
     down = max(1, round(camera.height / side_px))
-    return ((rows * down) // camera.height)[:, None] * across + (columns * across) // camera.width
+    return (rows * down) // camera.height * across, torch.full_like(rows, across)
+
+
+def equal_area_cells(camera: Camera, count: int, *, device: torch.device | str = "cpu") -> Int64[Tensor, "H W"]:
+    """Number the pixels' cells: about `count` cells of nearly equal solid angle over the image (`equal_area_rows`)."""
+    first, cells = equal_area_rows(camera, count, device=device)
+    columns = torch.arange(camera.width, device=device)
+    return first[:, None] + (columns * cells[:, None]) // camera.width
+
+
+def cell_of(camera: Camera, count: int, pixel: Int64[Tensor, "N"]) -> Int64[Tensor, "N"]:
+    """Return the cells of flat pixels, as `equal_area_cells` numbers them."""
+    first, cells = equal_area_rows(camera, count, device=pixel.device)
+    row = pixel // camera.width
+    return first[row] + (pixel % camera.width * cells[row]) // camera.width
 
 
 def select_pixels(
@@ -83,13 +103,22 @@ def select_about(
     count: int,
     *,
     minimum: float,
+    select: Callable[..., Int64[Tensor, "N"]] = select_pixels,
 ) -> Int64[Tensor, "N"]:
     """Choose about `count` pixels as `select_pixels` does: the cells become smaller where many of them give none.
 
     A sky, a mask or a blank wall would otherwise take its share of the points with it.
+
+    Args:
+        strength: As of `select_pixels`, as are the others.
+        usable: Likewise.
+        camera: Likewise.
+        count: How many pixels are wanted.
+        minimum: Likewise.
+        select: What chooses: `select_pixels`, or what does the same faster.
     """
-    pixel = select_pixels(strength, usable, camera, count, minimum=minimum)
+    pixel = select(strength, usable, camera, count, minimum=minimum)
     if not 0 < len(pixel) < 0.9 * count:
         return pixel
     cells = round(count * min(MOST_CELLS, count / len(pixel)))
-    return select_pixels(strength, usable, camera, cells, minimum=minimum)
+    return select(strength, usable, camera, cells, minimum=minimum)

@@ -21,7 +21,7 @@ from torch import Tensor
 
 from torchvo360.cameras import Camera, check_image_size
 from torchvo360.checks import InputError, check_shape
-from torchvo360.image import blur, resample
+from torchvo360.image import blur_radius, pad_image, resample
 
 WIDTH = 64
 """Columns of the small image."""
@@ -32,6 +32,7 @@ FREQUENCIES = 10
 DESCRIPTOR_SIZE = 2 * BANDS * FREQUENCIES
 LOCAL_PX = 10.0
 """Standard deviation, in pixels of the small image, of the window of the local mean and contrast."""
+LOCAL_RADIUS = blur_radius(LOCAL_PX)
 CONTRAST_FLOOR = 0.1
 """Share of the image's mean variance that is added to the local one: smooth areas are not blown up to noise."""
 MIN_SHARE = 0.5
@@ -67,6 +68,17 @@ def _known_small(
     return total / share.clamp_min(1e-6), share, small
 
 
+def _local(size: int, device: torch.device) -> Float[Tensor, "n m"]:
+    """Return the Gaussian of the local mean along one axis as a matrix, from padded numbers to `size` of them.
+
+    Of so wide a filter and so small an image two products are twenty times faster than two convolutions.
+    """
+    from_, to = torch.arange(size + 2 * LOCAL_RADIUS, device=device), torch.arange(size, device=device)[:, None]
+    away = from_ - to - LOCAL_RADIUS
+    weight = torch.exp(-0.5 * (away / LOCAL_PX).square()) * (away.abs() <= LOCAL_RADIUS)
+    return weight / weight.sum(1, keepdim=True)
+
+
 def describe_place(
     image: Float[Tensor, "H W"], camera: Camera, known: Bool[Tensor, "H W"] | None = None
 ) -> Float[Tensor, "D"]:
@@ -86,10 +98,14 @@ def describe_place(
     check_image_size("image", image, camera)
     value, share, small = _known_small(image, known, camera)
     weight = share * (share >= MIN_SHARE)
-    window = blur(weight, small, LOCAL_PX)
-    known_here = window.clamp_min(1e-6)
-    centred = (value - blur(value * weight, small, LOCAL_PX) / known_here) * (weight > 0)
-    spread = blur(centred.square() * weight, small, LOCAL_PX) / known_here
+    down, across = _local(small.height, image.device), _local(small.width, image.device).T
+
+    def around(grid: Tensor) -> Tensor:
+        return down @ pad_image(grid, small, LOCAL_RADIUS) @ across
+
+    known_here = around(weight).clamp_min(1e-6)
+    centred = (value - around(value * weight) / known_here) * (weight > 0)
+    spread = around(centred.square() * weight) / known_here
     area = small.solid_angle(small.pixel_grid(device=image.device)) * weight
     typical = (spread * area).sum() / area.sum().clamp_min(1e-9)
     normal = centred * (spread + CONTRAST_FLOOR * typical).clamp_min(1e-12).rsqrt()

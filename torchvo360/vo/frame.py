@@ -9,9 +9,11 @@ import torch
 from jaxtyping import Bool, Float, Float32, Float64, Int64, UInt8
 from torch import Tensor
 
+from torchvo360.backends.numba.images import look_up_usable
+from torchvo360.backends.numba.pictures import gradient_strength, padded_levels
 from torchvo360.cameras import Camera, Rig
-from torchvo360.image import gradient_magnitude, level_camera, pad_image, resample
-from torchvo360.residuals.direct import Target, look_up_usable, make_target
+from torchvo360.image import level_camera, pad_image, resample
+from torchvo360.residuals.direct import Target
 from torchvo360.vo.sensor import Sensed, SensorConfig, read_depth
 
 
@@ -105,12 +107,11 @@ class FrameBuilder:
     ) -> PyramidFrame:
         """Return the frame of a colour image, and of what a rig's further cameras and a depth sensor saw with it."""
         grey = cv2.cvtColor(colour, cv2.COLOR_RGB2GRAY)
-        level = torch.from_numpy(self._smoothed(grey, self.cameras[0])).to(self.device)
-        targets = []
-        for camera, confidence in zip(self.cameras, self._confidence, strict=True):
-            level = resample(level, camera)
-            padded = pad_image(level[None, None], camera, 1).contiguous()
-            targets.append(Target(camera, padded, confidence, self.saturation))
+        levels = padded_levels(grey, self.cameras, self.blur_px, self.device)
+        targets = [
+            Target(camera, padded, confidence, self.saturation)
+            for camera, padded, confidence in zip(self.cameras, levels, self._confidence, strict=True)
+        ]
         further = tuple(self._other(image, at) for at, image in enumerate(others, start=1))
         sensed = read_depth(depth, self.cameras[0], self._sensor, self.device)
         return PyramidFrame(index, t_ns, grey, colour, targets, further, sensed)
@@ -118,23 +119,13 @@ class FrameBuilder:
     def _other(self, colour: UInt8[np.ndarray, "H W 3"] | None, at: int) -> Target | None:
         if colour is None or self.rig is None:
             return None
-        camera = self.rig.cameras[at]
-        image = torch.from_numpy(self._smoothed(cv2.cvtColor(colour, cv2.COLOR_RGB2GRAY), camera)).to(self.device)
-        return make_target(image[None, None], camera, saturation=self.saturation)
-
-    def _smoothed(self, grey: UInt8[np.ndarray, "H W"], camera: Camera) -> Float[np.ndarray, "H W"]:
-        """Return the image in [0, 1], smoothed by OpenCV, which is fifteen times faster here than a convolution."""
-        level = grey.astype(np.float32) * np.float32(1 / 255)
-        if self.blur_px <= 0:
-            return level
-        margin = max(1, round(3 * self.blur_px))
-        wide = pad_image(torch.from_numpy(level), camera, margin).numpy()
-        smooth = cv2.GaussianBlur(wide, (2 * margin + 1, 2 * margin + 1), self.blur_px)
-        return np.ascontiguousarray(smooth[margin:-margin, margin:-margin])
+        camera, grey = self.rig.cameras[at], cv2.cvtColor(colour, cv2.COLOR_RGB2GRAY)
+        (padded,) = padded_levels(grey, [camera], self.blur_px, self.device)
+        return Target(camera, padded, saturation=self.saturation)
 
     def strength(self, frame: PyramidFrame) -> Float[Tensor, "H W"]:
         """Return the gradient magnitude of the finest level, intensity per pixel."""
-        return gradient_magnitude(frame.image, self.cameras[0], self._rays)
+        return gradient_strength(frame.targets[0], self._rays)
 
     def usable(self, frame: PyramidFrame) -> Bool[Tensor, "H W"]:
         """Return the pixels that may become points: unmasked and not clipped."""

@@ -3,19 +3,23 @@
 The points of a new keyframe are traced backwards into the last ones, which makes them usable at once. Along each
 point's great circle (mathematics.md, section 5) every pixel of arc is compared by five samples spaced along the curve,
 which takes one look-up a pixel; the best few places are then compared through the whole pattern, in all views.
+
+These two are compiled passes over the points where numba serves (`backends.numba`), and eager torch elsewhere.
 """
 
 import math
 from dataclasses import dataclass
 from typing import NamedTuple
 
+import numpy as np
 import torch
 from jaxtyping import Bool, Float, Float64
 from torch import Tensor
 
+from torchvo360.backends.numba.images import can_see, image_view, look_up_usable, plain
 from torchvo360.checks import InputError, check_finite_number
 from torchvo360.depth.epipolar import HALF_PATTERN, GreatCircles, great_circles, reference_samples
-from torchvo360.residuals.direct import Target, look_up_usable
+from torchvo360.residuals.direct import Target
 from torchvo360.window.points import WindowPoints
 
 FINE_STEPS = (-1.0, -0.5, 0.0, 0.5, 1.0)
@@ -122,6 +126,8 @@ def _walk(
     samples = samples * math.exp(float(view.affine[0])) + float(view.affine[1])
     offsets = torch.arange(-HALF_PATTERN, reach + HALF_PATTERN + 1, dtype=centre.dtype, device=centre.device)
     theta = offsets * step
+    if can_see(view.target, also=(samples,)):
+        return _walk_compiled(circles, samples, theta, view.target, config)
     direction = circles.start[..., None] * theta.cos() + circles.towards[..., None] * theta.sin()
     seen = look_up_usable(view.target, direction).unfold(1, 2 * HALF_PATTERN + 1, 1)
     difference = (seen - samples[:, None]).abs().clamp_max(config.max_difference)
@@ -136,6 +142,25 @@ def _walk(
     return place.to(centre.dtype), value < NEVER
 
 
+def _walk_compiled(
+    circles: GreatCircles, samples: Float[Tensor, "N 5"], theta: Float[Tensor, "L"], target: Target, config: TraceConfig
+) -> tuple[Float[Tensor, "N C"], Bool[Tensor, "N C"]]:
+    from torchvo360.backends.numba.kernels.tracing import walk
+
+    count = min(config.candidates, len(theta) - 2 * HALF_PATTERN)
+    place, value = (samples.new_empty(len(samples), count) for _ in range(2))
+    walk(
+        *(plain(part) for part in (circles.start, circles.towards, 0.9 * circles.phi, samples)),
+        *(plain(part) for part in (theta, theta.cos(), theta.sin())),
+        image_view(target),
+        np.float32(config.max_difference),
+        np.float32(NEVER),
+        place.numpy(),
+        value.numpy(),
+    )
+    return place, value < NEVER
+
+
 def _pattern_cost(
     points: WindowPoints, rho: Float[Tensor, "N M"], views: list[View], config: TraceConfig
 ) -> Float[Tensor, "N M"]:
@@ -144,6 +169,8 @@ def _pattern_cost(
     What moves by itself may fit one view at a false range, but then not the other; a view that does not see a place
     says nothing of it.
     """
+    if can_see(*(view.target for view in views), also=(rho, points.ray)):
+        return _pattern_cost_compiled(points, rho, views, config)
     weight = points.weight
     whole = weight.sum(1, keepdim=True).clamp_min(1e-6)
     worst, seen_by = torch.zeros_like(rho), torch.zeros_like(rho)
@@ -160,3 +187,24 @@ def _pattern_cost(
         worst = torch.where(sees, torch.maximum(worst, (square * w).sum(-1) / total.clamp_min(1e-6)), worst)
         seen_by += sees
     return torch.where(seen_by > 0, worst, NEVER)
+
+
+def _pattern_cost_compiled(
+    points: WindowPoints, rho: Float[Tensor, "N M"], views: list[View], config: TraceConfig
+) -> Float[Tensor, "N M"]:
+    from torchvo360.backends.numba.kernels.tracing import compare_patterns
+
+    worst, sees = torch.zeros_like(rho), torch.zeros_like(rho, dtype=torch.bool)
+    arrays = [plain(part) for part in (points.ray, points.value, points.weight, rho)]
+    for view in views:
+        compare_patterns(
+            *arrays,
+            plain(view.T_tgt_host.double()),
+            np.float32(math.exp(float(view.affine[0]))),
+            np.float32(view.affine[1]),
+            image_view(view.target),
+            np.float32(config.max_difference),
+            worst.numpy(),
+            sees.numpy(),
+        )
+    return torch.where(sees, worst, NEVER)

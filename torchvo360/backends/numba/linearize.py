@@ -91,7 +91,7 @@ def as_arrays(
         T_tgt_ref.detach().double().contiguous().numpy(),
         affine.detach().double().contiguous().numpy(),
         _intrinsics(target),
-        _optics(target),
+        optics_of(target),
         _loss(loss, target.saturation, noise),
     )
 
@@ -109,7 +109,8 @@ def _intrinsics(target: Target) -> np.ndarray:
     return _array(target.intrinsics)
 
 
-def _optics(target: Target) -> tuple[int, bool, bool, np.float32]:
+def optics_of(target: Target) -> tuple[int, bool, bool, np.float32]:
+    """Return how the passes project: see `kernels.pairs.sum_pairs`."""
     camera = target.camera
     if isinstance(camera, Pinhole):
         return PINHOLE, False, False, np.float32(0)

@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from torchvo360 import lie
+from torchvo360.backends.numba.pictures import select_pixels
 from torchvo360.depth import guess_around
 from torchvo360.image import select_about
 from torchvo360.vo.config import OdometryConfig
@@ -51,7 +52,14 @@ def fresh_points(
         metric: Whether the window's unit is the metre, which a sensor's ranges need.
     """
     camera, strength = builder.cameras[0], builder.strength(frame)
-    pixel = select_about(strength, builder.usable(frame), camera, config.map.points, minimum=config.map.min_gradient)
+    pixel = select_about(
+        strength,
+        builder.usable(frame),
+        camera,
+        config.map.points,
+        minimum=config.map.min_gradient,
+        select=select_pixels,
+    )
     start = strength.new_ones(len(pixel))
     points = make_points(frame.targets[0], pixel, builder.rays(pixel), start, config.window, place)
     points = points.take((points.weight.sum(1) > 0).nonzero()[:, 0])

@@ -7,9 +7,9 @@ from jaxtyping import Bool, Float64, Int64
 from torch import Tensor
 
 from torchvo360 import lie
+from torchvo360.backends.numba.images import look_up_value
 from torchvo360.depth import InverseRange
-from torchvo360.image import equal_area_cells, one_per_cell
-from torchvo360.residuals.direct import look_up_value
+from torchvo360.image import cell_of, one_per_cell
 from torchvo360.vo.config import OdometryConfig
 from torchvo360.vo.frame import FrameBuilder, PyramidFrame
 from torchvo360.vo.inertial import InertialLink
@@ -66,9 +66,9 @@ class Mapper:
         mapper._add(key.frame, lie.se3_inverse(key.T_world_key), torch.zeros(2, dtype=torch.float64))
         index = key.trusted(config.map.max_relative_variance).nonzero()[:, 0]
         rho, variance, _ = key.points
-        cell = equal_area_cells(builder.cameras[0], config.map.points, device=rho.device).flatten()
+        cell = cell_of(builder.cameras[0], config.map.points, key.pixel[index])
         # By the gradient, not by V: a variance that goes with a noisy rho would prefer those that came out too near.
-        index = index[one_per_cell(cell[key.pixel[index]], -key.slope[index])]
+        index = index[one_per_cell(cell, -key.slope[index])]
         information = config.track.noise**2 / variance[index] if known else None
         target = key.frame.targets[0]
         ray, pixel = key.ray[:, index], key.pixel[index]
@@ -233,9 +233,11 @@ class Mapper:
         if points is None:
             return torch.ones_like(pixel, dtype=torch.bool)
         seen = project_points(points, self.window.frames, place, self.config.map.max_difference)
-        cell = equal_area_cells(self.builder.cameras[0], self.config.map.points, device=pixel.device).flatten()
-        crowd = torch.bincount(cell[seen.pixel[seen.shown]], minlength=int(cell.max()) + 1)
-        return crowd[cell[pixel]] < self.config.window.keyframes
+        camera, count = self.builder.cameras[0], self.config.map.points
+        cell = cell_of(camera, count, pixel)
+        taken = cell_of(camera, count, seen.pixel[seen.shown])
+        crowd = torch.bincount(taken, minlength=int(cell.max()) + 1 if len(cell) else 0)
+        return crowd[cell] < self.config.window.keyframes
 
     def reference(self, place: int = -1) -> Keyframe:
         """Return the window's points as one keyframe sees them: what the next frames are tracked against."""

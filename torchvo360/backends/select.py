@@ -8,9 +8,9 @@ from contextlib import contextmanager
 import torch
 from jaxtyping import Float
 from torch import Tensor
-from torch.autograd import forward_ad
 
 from torchvo360.backends import eager, numba
+from torchvo360.backends.transforms import in_transform
 from torchvo360.checks import InputError, check_choice
 from torchvo360.residuals.direct import Reference, Target
 from torchvo360.residuals.normal import NormalEquations
@@ -62,7 +62,7 @@ def use_numba(*tensors: Tensor | None) -> bool:
     It serves what is on the CPU and asks for no derivative: neither backwards, nor forwards, nor by `torch.func`; and
     not what `torch.compile` compiles.
     """
-    if _in_transform() or _asked == "eager" or not has_numba():
+    if in_transform() or _asked == "eager" or not has_numba():
         return False
     gradients = torch.is_grad_enabled()
     return all(
@@ -74,12 +74,3 @@ def use_numba(*tensors: Tensor | None) -> bool:
 def has_numba() -> bool:
     """Return whether numba is installed."""
     return importlib.util.find_spec("numba") is not None
-
-
-def _in_transform() -> bool:
-    """Return whether tensors may be no plain numbers: compiled, mapped, or differentiated forwards."""
-    return (
-        torch.compiler.is_compiling()
-        or torch._C._functorch.peek_interpreter_stack() is not None  # pyright: ignore[reportAttributeAccessIssue]
-        or forward_ad._current_level >= 0
-    )

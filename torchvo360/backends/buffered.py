@@ -103,8 +103,8 @@ def look_up(
             Y = torch.where(seen[:, None], Y, Y.new_tensor([0.0, 0.0, 1.0])[:, None])
             weight = weight * seen
     x, y, z = Y.unbind(1)
-    inv_scale = camera.scale_of(x, y, z).reciprocal()[:, None]
-    u, v = camera.pixel_of(x, y, z, k)
+    u, v, inv_scale = camera.pixel_and_inverse_scale_of(x, y, z, k)
+    inv_scale = inv_scale[:, None]
     taps = _locate(u, v, camera, room)
     value, g_u, g_v = _interpolate(target.padded, taps, room)
     if target.confidence is not None:

@@ -67,8 +67,10 @@ def linearize(
             cost = (samples.weight * weighed.cost).sum((1, 2)).double()
             weight = samples.weight.sum((1, 2)).double() * (C / samples.weight.shape[1])
             parts.append((M, cost, weight))
-        groups.append([torch.stack(column).sum(0) for column in zip(*parts, strict=True)])
-    M, cost, total = (torch.cat(column) for column in zip(*groups, strict=True))
+        groups.append(
+            [column[0] if len(parts) == 1 else torch.stack(column).sum(0) for column in zip(*parts, strict=True)]
+        )
+    M, cost, total = groups[0] if len(groups) == 1 else (torch.cat(column) for column in zip(*groups, strict=True))
     return NormalEquations(M[:, :8, :8], M[:, :8, 8], cost, total, M[:, 8, 8])
 
 

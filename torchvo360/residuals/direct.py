@@ -193,8 +193,7 @@ def look_up(
             Y = torch.where(seen[:, None], Y, Y.new_tensor([0.0, 0.0, 1.0])[:, None])
             weight = weight * seen
     x, y, z = Y.unbind(1)
-    inv_scale = camera.scale_of(x, y, z).reciprocal()
-    u, v = camera.pixel_of(x, y, z, k)
+    u, v, inv_scale = camera.pixel_and_inverse_scale_of(x, y, z, k)
     taps = locate(u, v, camera)
     value, g_u, g_v = interpolate(target.padded, taps)
     if target.confidence is not None:

@@ -14,11 +14,14 @@ import torch.nn.functional as F
 from jaxtyping import Float, Float64
 from torch import Tensor
 
+from torchvo360.backends import buffered
+from torchvo360.backends.buffered import ALIGNED
 from torchvo360.residuals.direct import (
     Reference,
     Samples,
     Target,
     look_up,
+    nine_rows,
     system_rows,
     weight_slope_rows,
 )
@@ -30,9 +33,6 @@ CHUNK_SAMPLES = 49152
 
 SUM_SAMPLES = 2048
 """Samples summed in the dtype of the rows before float64 takes over: errors of a float32 H stay near 1e-7, not 1e-6."""
-
-ALIGNED = 16
-"""Numbers of samples are brought to a multiple of this, by zeros."""
 
 
 def linearize(
@@ -55,18 +55,22 @@ def linearize(
         noise: Standard deviation of an intensity, for the weights of points with a variance.
     """
     C = reference.value.shape[1]
+    in_buffers = buffered.serves(reference, target, T_tgt_ref, affine)
     groups = []
     for chunks in _divided(reference, target, T_tgt_ref, affine):
         parts = []
         for points, images, T, ab in chunks:
-            samples = look_up(points, images, T, ab)
+            room = buffered.room_for(points) if in_buffers else None
+            samples = look_up(points, images, T, ab) if room is None else buffered.look_up(points, images, T, ab, room)
             weighed = weigh(samples, points, T[:, :3, 3], loss, noise)
-            M = gram(samples, weighed, T[:, :3, 3])
+            M = gram(samples, weighed, T[:, :3, 3], room)
             cost = (samples.weight * weighed.cost).sum((1, 2)).double()
             weight = samples.weight.sum((1, 2)).double() * (C / samples.weight.shape[1])
             parts.append((M, cost, weight))
-        groups.append([torch.stack(column).sum(0) for column in zip(*parts, strict=True)])
-    M, cost, total = (torch.cat(column) for column in zip(*groups, strict=True))
+        groups.append(
+            [column[0] if len(parts) == 1 else torch.stack(column).sum(0) for column in zip(*parts, strict=True)]
+        )
+    M, cost, total = groups[0] if len(groups) == 1 else (torch.cat(column) for column in zip(*groups, strict=True))
     return NormalEquations(M[:, :8, :8], M[:, :8, 8], cost, total, M[:, 8, 8])
 
 
@@ -93,28 +97,36 @@ def _divided(reference: Reference, target: Target, T_tgt_ref: Tensor, affine: Te
         yield chunks(slice(first, first + group))
 
 
-def gram(samples: Samples, weighed: Weighed, t_tgt_ref: Float[Tensor, "B 3"]) -> Float64[Tensor, "B 9 9"]:
-    """Return `S W S^T` of the Jacobian's eight columns and the residual."""
+def gram(
+    samples: Samples, weighed: Weighed, t_tgt_ref: Float[Tensor, "B 3"], room: buffered.Room | None = None
+) -> Float64[Tensor, "B 9 9"]:
+    """Return `S W S^T` of the Jacobian's eight columns and the residual, with S in buffers where there are any."""
     W = samples.weight * weighed.weight
-    if torch.is_grad_enabled():
+    if room is None and torch.is_grad_enabled():
         # Without the roots, whose slope is infinite where a weight is zero.
-        S = _rows(samples, weighed, t_tgt_ref, torch.ones_like(W))
+        S = _rows(samples, weighed, t_tgt_ref, torch.ones_like(W), None)
         return _product(S * W.flatten(1)[:, None], S)
-    S = _rows(samples, weighed, t_tgt_ref, W.sqrt())
+    S = _rows(samples, weighed, t_tgt_ref, W.sqrt(), room)
     return _product(S, S)
 
 
-def _rows(samples: Samples, weighed: Weighed, t_tgt_ref: Tensor, root: Tensor) -> Float[Tensor, "B 9 M"]:
-    S = system_rows(samples, root)
+def _rows(
+    samples: Samples, weighed: Weighed, t_tgt_ref: Tensor, root: Tensor, room: buffered.Room | None
+) -> Float[Tensor, "B 9 M"]:
+    if room is None:
+        S = system_rows(samples, root)
+    else:
+        nine_rows(samples, root, room.rows)
+        S = room.S
     if weighed.slope is not None:
-        S[:, :6] += weight_slope_rows(samples, weighed.slope * samples.residual * root, t_tgt_ref)
+        slopes = weight_slope_rows(samples, weighed.slope * samples.residual * root, t_tgt_ref)
+        S[:, :6, : slopes.shape[2]] += slopes
     return S
 
 
 def _product(A: Float[Tensor, "B 9 M"], S: Float[Tensor, "B 9 M"]) -> Float64[Tensor, "B 9 9"]:
     """Return `A S^T`, summed block by block."""
     if S.shape[2] % ALIGNED:
-        # An element's rows begin at a multiple of 64 bytes wherever it stands in a batch: products depend on that.
         A, S = (F.pad(x, (0, -x.shape[2] % ALIGNED)) for x in (A, S))
     blocks = S.shape[2] // SUM_SAMPLES
     if blocks < 2 or not len(S):

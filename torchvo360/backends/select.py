@@ -8,10 +8,10 @@ from contextlib import contextmanager
 import torch
 from jaxtyping import Float
 from torch import Tensor
-from torch.autograd import forward_ad
 
 from torchvo360.backends import comparison, eager, numba
 from torchvo360.backends.comparison import Comparison
+from torchvo360.backends.transforms import in_transform
 from torchvo360.checks import InputError, check_choice
 from torchvo360.residuals.direct import Reference, Target
 from torchvo360.residuals.normal import NormalEquations
@@ -76,7 +76,7 @@ def use_numba(*tensors: Tensor | None) -> bool:
 
 def are_plain(*tensors: Tensor | None) -> bool:
     """Return whether tensors are numbers on the CPU that ask for no derivative: NumPy and numba may have them."""
-    if _in_transform():
+    if in_transform():
         return False
     gradients = torch.is_grad_enabled()
     return all(
@@ -88,12 +88,3 @@ def are_plain(*tensors: Tensor | None) -> bool:
 def has_numba() -> bool:
     """Return whether numba is installed."""
     return importlib.util.find_spec("numba") is not None
-
-
-def _in_transform() -> bool:
-    """Return whether tensors may be no plain numbers: compiled, mapped, or differentiated forwards."""
-    return (
-        torch.compiler.is_compiling()
-        or torch._C._functorch.peek_interpreter_stack() is not None  # pyright: ignore[reportAttributeAccessIssue]
-        or forward_ad._current_level >= 0
-    )

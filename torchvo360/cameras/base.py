@@ -78,6 +78,16 @@ class Camera(ABC):
         Components come and go apart because stacking them costs more than the formula.
         """
 
+    def pixel_and_inverse_scale_of(
+        self,
+        x: Float[Tensor, "*batch"],
+        y: Float[Tensor, "*batch"],
+        z: Float[Tensor, "*batch"],
+        k: Intrinsics | None = None,
+    ) -> tuple[Float[Tensor, "*batch"], Float[Tensor, "*batch"], Float[Tensor, "*batch"]]:
+        """Return `pixel_of` and the inverse of `scale_of`, for cameras whose formulas share their terms."""
+        return *self.pixel_of(x, y, z, k), self.scale_of(x, y, z).reciprocal()
+
     @abstractmethod
     def normalized_of(
         self, x: Float[Tensor, "*batch"], y: Float[Tensor, "*batch"], z: Float[Tensor, "*batch"]

@@ -85,12 +85,28 @@ class Equirectangular(Camera):
         z: Float[Tensor, "*batch"],
         k: Intrinsics | None = None,
     ) -> tuple[Float[Tensor, "*batch"], Float[Tensor, "*batch"]]:
-        fx, fy, cx, cy = self.intrinsics if k is None else k
         lon, minus_lat = self._longitude_minus_latitude_of(x, y, z)
-        u = lon * fx + cx
+        return self._pixel_of_angles(lon, minus_lat, k)
+
+    def pixel_and_inverse_scale_of(
+        self,
+        x: Float[Tensor, "*batch"],
+        y: Float[Tensor, "*batch"],
+        z: Float[Tensor, "*batch"],
+        k: Intrinsics | None = None,
+    ) -> tuple[Float[Tensor, "*batch"], Float[Tensor, "*batch"], Float[Tensor, "*batch"]]:
+        horizontal2 = torch.addcmul(x * x, z, z).add_(AXIS_SHIFT**2)
+        lon, minus_lat = torch.atan2(x, z + AXIS_SHIFT), torch.atan2(y, horizontal2.sqrt())
+        return *self._pixel_of_angles(lon, minus_lat, k), torch.addcmul(horizontal2, y, y).rsqrt_()
+
+    def _pixel_of_angles(
+        self, lon: Float[Tensor, "*batch"], minus_lat: Float[Tensor, "*batch"], k: Intrinsics | None
+    ) -> tuple[Float[Tensor, "*batch"], Float[Tensor, "*batch"]]:
+        fx, fy, cx, cy = self.intrinsics if k is None else k
         if k is not None or not (self.wraps and cx == self.width / 2):
-            u = torch.remainder(u, self._period if self.wraps else abs(fx) * math.tau)
-        return u, minus_lat * -fy + cy
+            u = torch.remainder(lon * fx + cx, self._period if self.wraps else abs(fx) * math.tau)
+            return u, minus_lat * -fy + cy
+        return lon.mul_(fx).add_(cx), minus_lat.mul_(-fy).add_(cy)
 
     def normalized_of(
         self, x: Float[Tensor, "*batch"], y: Float[Tensor, "*batch"], z: Float[Tensor, "*batch"]
@@ -145,14 +161,15 @@ class Equirectangular(Camera):
         x, y, z = ray
         # Nearer to a pole than the first row's centre an interpolated gradient along u no longer shrinks with cos(lat):
         # there 1 / cos(lat) is held at that row's value, or G would grow without bound; G . ray stays 0.
+        # Fresh results are written over while they are in the cache; each is mapped by `vmap` where what enters it is.
         horizontal2 = torch.addcmul(x * x, z, z)
-        inv_cos_lat = horizontal2.clamp_min(math.sin(0.5 / self.intrinsics[1]) ** 2).rsqrt()
+        inv_cos_lat = horizontal2.clamp_min(math.sin(0.5 / self.intrinsics[1]) ** 2).rsqrt_()
         along_lat = g_v * fy
-        radial = along_lat * y * inv_cos_lat
-        turn = g_u * fx * inv_cos_lat * inv_cos_lat
+        radial = (along_lat * y).mul_(inv_cos_lat)
+        turn = (g_u * fx * inv_cos_lat).mul_(inv_cos_lat)
         Gx = torch.addcmul(radial * x, turn, z)
         Gz = torch.addcmul(radial * z, turn, x, value=-1)
-        return Gx, -along_lat * horizontal2 * inv_cos_lat, Gz
+        return Gx, (along_lat * horizontal2).mul_(inv_cos_lat).neg_(), Gz
 
     def gradient_of(
         self,

@@ -176,7 +176,7 @@ def look_up(
     """
     # Aliases: gradients of the several uses are summed here first, in one order whatever part of a batch this is.
     rho, T_tgt_ref = reference.rho.view_as(reference.rho), T_tgt_ref.view_as(T_tgt_ref)
-    k, k_of_channels = _broadcast(target.intrinsics)
+    k, k_of_channels = broadcast_intrinsics(target.intrinsics)
     R, t = T_tgt_ref[:, :3, :3], T_tgt_ref[:, :3, 3:]
     if T_tgt_ref.requires_grad:
         # The derivative of a matrix product depends on where in memory an element of a batch begins.
@@ -193,8 +193,7 @@ def look_up(
             Y = torch.where(seen[:, None], Y, Y.new_tensor([0.0, 0.0, 1.0])[:, None])
             weight = weight * seen
     x, y, z = Y.unbind(1)
-    inv_scale = camera.scale_of(x, y, z).reciprocal()
-    u, v = camera.pixel_of(x, y, z, k)
+    u, v, inv_scale = camera.pixel_and_inverse_scale_of(x, y, z, k)
     taps = locate(u, v, camera)
     value, g_u, g_v = interpolate(target.padded, taps)
     if target.confidence is not None:
@@ -217,7 +216,7 @@ def look_up(
     )
 
 
-def _broadcast(intrinsics: Tensor | None) -> tuple[Intrinsics | None, Intrinsics | None]:
+def broadcast_intrinsics(intrinsics: Tensor | None) -> tuple[Intrinsics | None, Intrinsics | None]:
     """Return intrinsics as they broadcast with [B, N] and with [B, C, N]."""
     if intrinsics is None:
         return None, None
@@ -258,7 +257,7 @@ def by_intrinsics(
             None where the rays do not depend on this k.
     """
     camera = target.camera
-    _, k_of_channels = _broadcast(target.intrinsics)
+    _, k_of_channels = broadcast_intrinsics(target.intrinsics)
     g_u, g_v = camera.gradient_of(samples.ray, samples.G, k_of_channels)
     a_u, a_v = camera.normalized_of(*samples.ray)
     rows = torch.stack([g_u * a_u, g_v * a_v, g_u, g_v], 1)
@@ -270,20 +269,28 @@ def by_intrinsics(
 
 def system_rows(samples: Samples, root_weight: Float[Tensor, "B C N"]) -> Float[Tensor, "B 9 M"]:
     """Return the Jacobian's eight columns by (v, w, a, b) and the residual, all times a root of a weight; M = C N."""
+    return torch.stack(nine_rows(samples, root_weight), 1).flatten(2)
+
+
+def nine_rows(
+    samples: Samples, root_weight: Float[Tensor, "B C N"], out: tuple[Tensor, ...] | None = None
+) -> tuple[Tensor, ...]:
+    """Return the rows of `system_rows` as nine tensors [B, C, N]: in `out`, or new ones."""
+    to = (None,) * 9 if out is None else out
     rx, ry, rz = samples.ray
     Gx, Gy, Gz = (component * root_weight for component in samples.G)
-    rows = [
-        samples.rho * Gx,
-        samples.rho * Gy,
-        samples.rho * Gz,
-        torch.addcmul(ry * Gz, rz, Gy, value=-1),
-        torch.addcmul(rz * Gx, rx, Gz, value=-1),
-        torch.addcmul(rx * Gy, ry, Gx, value=-1),
-        samples.gained * -root_weight,
-        -root_weight,
-        samples.residual * root_weight,
-    ]
-    return torch.stack(rows, 1).flatten(2)
+    minus = torch.neg(root_weight, out=to[7])
+    return (
+        torch.mul(samples.rho, Gx, out=to[0]),
+        torch.mul(samples.rho, Gy, out=to[1]),
+        torch.mul(samples.rho, Gz, out=to[2]),
+        torch.addcmul(torch.mul(ry, Gz, out=to[3]), rz, Gy, value=-1, out=to[3]),
+        torch.addcmul(torch.mul(rz, Gx, out=to[4]), rx, Gz, value=-1, out=to[4]),
+        torch.addcmul(torch.mul(rx, Gy, out=to[5]), ry, Gx, value=-1, out=to[5]),
+        torch.mul(samples.gained, minus, out=to[6]),
+        minus,
+        torch.mul(samples.residual, root_weight, out=to[8]),
+    )
 
 
 def weight_slope_rows(

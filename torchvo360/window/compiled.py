@@ -14,7 +14,7 @@ from jaxtyping import Float, Float64
 from torch import Tensor
 
 from torchvo360.backends import use_numba
-from torchvo360.backends.numba.linearize import _intrinsics, _loss, _optics
+from torchvo360.backends.numba.linearize import intrinsics_of, loss_of, optics_of
 from torchvo360.cameras import Equirectangular, Pinhole
 from torchvo360.residuals.direct import Target
 from torchvo360.solve import schur
@@ -81,7 +81,7 @@ def sum_edges(
             continue
         confidence = NO_IMAGE if target.confidence is None else _array(target.confidence[0, 0])
         image = _array(target.padded[0, 0]), confidence
-        camera = _intrinsics(target)[0], _optics(target), _loss(config.loss, target.saturation, 0.0)
+        camera = intrinsics_of(target)[0], optics_of(target), loss_of(config.loss, target.saturation, 0.0)
         arguments = packed, T, at, affine, image, *camera, means, sums, cross, M[j] if keyframes else M
         if thresholds is None:
             means.fill(-1)

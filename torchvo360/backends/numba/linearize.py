@@ -90,9 +90,9 @@ def as_arrays(
         (_array(target.padded), confidence),
         T_tgt_ref.detach().double().contiguous().numpy(),
         affine.detach().double().contiguous().numpy(),
-        _intrinsics(target),
+        intrinsics_of(target),
         optics_of(target),
-        _loss(loss, target.saturation, noise),
+        loss_of(loss, target.saturation, noise),
     )
 
 
@@ -103,7 +103,7 @@ def _array(value: Tensor) -> np.ndarray:
     return value.detach().contiguous().numpy()
 
 
-def _intrinsics(target: Target) -> np.ndarray:
+def intrinsics_of(target: Target) -> np.ndarray:
     if target.intrinsics is None:
         return np.array([target.camera.intrinsics], np.float32)
     return _array(target.intrinsics)
@@ -119,7 +119,7 @@ def optics_of(target: Target) -> tuple[int, bool, bool, np.float32]:
     return SPHERE, camera.wraps, not centred, np.float32(math.sin(0.5 / fy) ** 2)
 
 
-def _loss(loss: LossConfig, saturation: float | None, noise: float) -> tuple[int | np.float32, ...]:
+def loss_of(loss: LossConfig, saturation: float | None, noise: float) -> tuple[int | np.float32, ...]:
     kind, *numbers = _robust(loss.name, loss.scale, loss.degrees_of_freedom, loss.cutoff)
     return (kind, *numbers, np.float32(math.inf if saturation is None else saturation), np.float32(noise))
 

@@ -38,8 +38,9 @@ def image_view(target: Target, *, usable: bool = True) -> ImageView:
     """
     camera = target.camera
     kind, wraps, wrap_again, _ = optics_of(target)
-    masked = usable and target.confidence is not None
-    confidence = plain(target.confidence[0, 0]) if masked else NO_CONFIDENCE
+    confidence = NO_CONFIDENCE
+    if usable and target.confidence is not None:
+        confidence = plain(target.confidence[0, 0])
     saturation = np.float32(target.saturation if usable and target.saturation is not None else np.inf)
     k = np.array(camera.intrinsics, np.float32)
     period = np.float32(camera.width if wraps else abs(camera.intrinsics[0]) * math.tau)

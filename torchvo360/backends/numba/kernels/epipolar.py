@@ -53,22 +53,15 @@ def _rho_by_angle(theta, baseline, keep):
 
 
 @compiled()
-def _sample_reference(ray, T, epipole, step, gain, offset, view, keep, samples):
-    """Write the circles, and the five samples of the reference along each, in the target's brightness."""
-    s, index = desk()
-    N = len(keep)
-    x, y, z, seen = np.zeros(5 * N, f4), np.zeros(5 * N, f4), np.zeros(5 * N, f4), np.zeros(5 * N, f4)
-    for i in range(N):
+def _around(ray, T, epipole, step, keep, x, y, z):
+    """Write the circles, and the directions of five samples of the reference along each."""
+    for i in range(len(keep)):
         d, e, f = _circle(ray, i, T, epipole, keep[i])
         for j in range(5):
             cosine, sine = math.cos((j - HALF) * step), math.sin((j - HALF) * step)
             x[5 * i + j] = ray[0, i] * cosine + d * sine
             y[5 * i + j] = ray[1, i] * cosine + e * sine
             z[5 * i + j] = ray[2, i] * cosine + f * sine
-    see(s, index, x, y, z, 5 * N, view, seen)
-    for i in range(N):
-        for j in range(5):
-            samples[i, j] = gain * seen[5 * i + j] + offset
 
 
 @compiled()
@@ -125,24 +118,23 @@ def _plan(rho, variance, baseline, step, settings, keep, samples):
         change = float(samples[j + 1]) - float(samples[j])
         slope2 += change * change
     slope2 /= 4
-    sigma = math.sqrt(variance)
+    rho, sigma = float(rho), math.sqrt(float(variance))
     nearest = _angle(rho + 2 * sigma, baseline, keep)
     farthest = _angle(max(rho - 2 * sigma, 0.0), baseline, keep)
     half_width = max((nearest - farthest) / (2 * step), 1.5)
     keep[SIGMA], keep[SLOPE2], keep[MIDDLE] = sigma, slope2, (nearest + farthest) / 2
     match_sigma = _rho_by_angle(_angle(rho, baseline, keep), baseline, keep) * step * 0.3
     worth = (
-        slope2 > min_gradient**2
-        and keep[SINE] > min_sine
-        and match_sigma < 2 * sigma
-        and half_width <= max_half_width
+        slope2 > min_gradient**2 and keep[SINE] > min_sine and match_sigma < 2 * sigma and half_width <= max_half_width
     )
     keep[WIDTH] = math.floor(half_width + 0.5) if worth else 0.0
     return worth
 
 
 @compiled(nogil=True)
-def search(ray, rho, variance, slope, T, affine, reference, target, step, settings, out_rho, out_variance, searched, found):
+def search(
+    ray, rho, variance, slope, T, affine, reference, target, step, settings, out_rho, out_variance, searched, found
+):
     """Match points of a reference image in a target image.
 
     Args:
@@ -166,19 +158,23 @@ def search(ray, rho, variance, slope, T, affine, reference, target, step, settin
     noise, position_error, line_error = settings[5], settings[6], settings[7]
     N, most = len(rho), int(settings[2])
     baseline = max(math.sqrt(T[0, 3] ** 2 + T[1, 3] ** 2 + T[2, 3] ** 2), 1e-12)
-    epipole = T[:3, 3] / baseline
-    keep, samples = np.zeros((N, EACH)), np.zeros((N, 5), f4)
-    _sample_reference(ray, T, epipole, step, f4(math.exp(affine[0])), f4(affine[1]), reference, keep, samples)
+    epipole = (T[0, 3] / baseline, T[1, 3] / baseline, T[2, 3] / baseline)
     s, index = desk()
+    keep, samples = np.zeros((N, EACH)), np.zeros(5 * N, f4)
     longest = 2 * most + 7
-    offsets = (np.arange(longest) - longest // 2) * step
-    cosine, sine = np.cos(offsets).astype(f4), np.sin(offsets).astype(f4)
-    room = TOGETHER + longest
+    room = max(TOGETHER + longest, 5 * N)
     x, y, z, seen = np.zeros(room, f4), np.zeros(room, f4), np.zeros(room, f4), np.zeros(room, f4)
-    ssd = np.zeros(longest)
+    _around(ray, T, epipole, step, keep, x, y, z)
+    see(s, index, x, y, z, 5 * N, reference, seen)
+    gain, offset = f4(math.exp(affine[0])), f4(affine[1])
+    for j in range(5 * N):
+        samples[j] = gain * seen[j] + offset
+    cosine, sine, ssd = np.zeros(longest, f4), np.zeros(longest, f4), np.zeros(longest)
+    for j in range(longest):
+        cosine[j], sine[j] = math.cos((j - longest // 2) * step), math.sin((j - longest // 2) * step)
     for i in range(N):
         out_rho[i], out_variance[i], found[i] = rho[i], f4(np.inf), False
-        searched[i] = _plan(float(rho[i]), float(variance[i]), baseline, step, settings, keep[i], samples[i])
+        searched[i] = _plan(rho[i], variance[i], baseline, step, settings, keep[i], samples[5 * i : 5 * i + 5])
     first = 0
     while first < N:
         last, count = first, 0
@@ -193,9 +189,9 @@ def search(ray, rho, variance, slope, T, affine, reference, target, step, settin
         for i in range(first, last):
             if not searched[i]:
                 continue
-            each = 2 * int(keep[i, WIDTH]) + 7
-            theta, clear = _match(seen[count : count + each], samples[i], step, max_ssd, min_distinction, keep[i], ssd)
-            count += each
+            own = samples[5 * i : 5 * i + 5]
+            theta, clear = _match(seen[count:], own, step, max_ssd, min_distinction, keep[i], ssd)
+            count += 2 * int(keep[i, WIDTH]) + 7
             if clear:
                 slope2 = max(keep[i, SLOPE2], 1e-12)
                 ratio = min(max(float(slope[i]) ** 2 / slope2, 1.0), 50.0)

@@ -5,9 +5,11 @@ import math
 import numpy as np
 
 from torchvo360.backends.numba.kernels.jit import FAST, compiled
-from torchvo360.backends.numba.kernels.scratch import HALF, ZERO, f4
+from torchvo360.backends.numba.kernels.scratch import HALF, f4
 
 QUARTER, STEP = f4(0.25), f4(1 / 255)
+INFINITE = np.int32(0x7F800000)
+"""The bits of infinity."""
 
 
 @compiled(fastmath=FAST)
@@ -32,9 +34,22 @@ def _weigh(wide, taps, out):
 
 
 @compiled(fastmath=FAST)
-def _add(out, tap, line):
-    for c in range(len(out)):
-        out[c] += tap * line[c]
+def _combine(lines, first, taps, out):
+    """Write the weighted sum of lines, which begin with one of them and go around, into a padded row."""
+    for c in range(lines.shape[1]):
+        out[c + 1] = taps[0] * lines[first, c]
+    for k in range(1, len(taps)):
+        tap, line = taps[k], lines[(first + k) % len(taps)]
+        for c in range(len(line)):
+            out[c + 1] += tap * line[c]
+
+
+@compiled()
+def _turn(row, by, out):
+    for c in range(by):
+        out[c] = row[c + len(row) - by]
+    for c in range(by, len(row)):
+        out[c] = row[c - by]
 
 
 @compiled(nogil=True)
@@ -61,14 +76,10 @@ def smooth(grey, taps, wraps, padded):
             # Across a pole the image goes on along the opposite meridian.
             _scale(grey[-1 - j if j < 0 else 2 * H - 1 - j], margin, wraps, wide)
             _weigh(wide, taps, turned)
-            line[:half] = turned[half:]
-            line[half:] = turned[:half]
+            _turn(turned, half, line)
         row = j - margin
         if row >= 0:
-            out = padded[row + 1, 1 : W + 1]
-            out[:] = ZERO
-            for k in range(size):
-                _add(out, taps[k], lines[(row + k) % size])
+            _combine(lines, row % size, taps, padded[row + 1])
 
 
 @compiled(nogil=True)
@@ -76,9 +87,9 @@ def edge(padded, wraps):
     """Fill the border of one pixel from the image within, as `image.pad_image` does."""
     H, W = padded.shape[0] - 2, padded.shape[1] - 2
     half = W // 2 if wraps else 0
-    for at, row in ((0, 1), (H + 1, H)):
-        padded[at, 1 : W + 1 - half] = padded[row, 1 + half : W + 1]
-        padded[at, W + 1 - half : W + 1] = padded[row, 1 : 1 + half]
+    for c in range(1, W + 1):
+        opposite = c + half if c + half <= W else c + half - W
+        padded[0, c], padded[H + 1, c] = padded[1, opposite], padded[H, opposite]
     for r in range(H + 2):
         padded[r, 0] = padded[r, W if wraps else 1]
         padded[r, W + 1] = padded[r, 1 if wraps else W]
@@ -121,7 +132,7 @@ def _rank(strength, usable, minimum, rank):
     for c in range(len(rank)):
         rank[c] = strength[c] if usable[c] else np.int32(-1)
     for c in range(len(rank)):
-        rank[c] = rank[c] if rank[c] >= minimum else np.int32(-1)
+        rank[c] = rank[c] if (rank[c] >= minimum) & (rank[c] <= INFINITE) else np.int32(-1)  # a NaN is beyond
 
 
 @compiled(nogil=True)

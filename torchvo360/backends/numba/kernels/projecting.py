@@ -77,8 +77,10 @@ def project(ray, centre, rho, host, value, weight, T, affine, own, view, most, o
     _find(s, out_ray, view, pixel, shown)
     found = np.empty(len(rho), f4)
     see(s, index, out_ray[0], out_ray[1], out_ray[2], len(rho), view, found)
-    back = np.exp(-affine[:, 0])
     gain = f4(math.exp(own[0]))
+    back = np.empty(len(T), f4)
+    for k in range(len(T)):
+        back[k] = math.exp(-affine[k, 0])
     for i in range(len(rho)):
         scene = (value[i, centre] - affine[host[i], 1]) * back[host[i]]
         # A NaN, where nothing usable is seen, fails the comparison.

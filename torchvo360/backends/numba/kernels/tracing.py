@@ -28,7 +28,7 @@ def _along(x, y, z, n, start, towards, i, cosine, sine):
 
 @compiled(fastmath=FAST)
 def _compare(seen, samples, i, n, most, never, ssd):
-    """Write the sums of five squared differences at n places."""
+    """Write the sums of five squared differences at n places, from the second number on."""
     a, b, c, d, e = samples[i, 0], samples[i, 1], samples[i, 2], samples[i, 3], samples[i, 4]
     for j in range(n):
         p, q, r, s, t = (
@@ -45,7 +45,7 @@ def _compare(seen, samples, i, n, most, never, ssd):
         s = most if s > most else s
         t = most if t > most else t
         total = p * p + q * q + r * r + s * s + t * t
-        ssd[j] = total if total < never else never
+        ssd[j + 1] = total if total < never else never
 
 
 @compiled(fastmath=FAST)
@@ -91,15 +91,17 @@ def walk(start, towards, limit, samples, theta, cosine, sine, view, most, never,
     N, C = place.shape
     L = len(theta)
     x, y, z, seen = np.zeros(L, f4), np.zeros(L, f4), np.zeros(L, f4), np.zeros(L, f4)
-    ssd, valley = np.full(L, never, f4), np.zeros(L, f4)
+    ssd, valley = np.zeros(L, f4), np.zeros(L, f4)
+    ssd[0] = never
     for i in range(N):
-        place[i], value[i] = ZERO, never
+        for c in range(C):
+            place[i, c], value[i, c] = ZERO, never
         n = _reach(theta, limit[i])
         if n == 0:
             continue
         _along(x, y, z, n + SAMPLES - 1, start, towards, i, cosine, sine)
         see(s, index, x, y, z, n + SAMPLES - 1, view, seen)
-        _compare(seen, samples, i, n, most, never, ssd[1:])
+        _compare(seen, samples, i, n, most, never, ssd)
         ssd[n + 1] = never
         _valleys(ssd, n, never, valley)
         for j in range(n):
@@ -165,8 +167,9 @@ def compare_patterns(ray, reference, weight, rho, T, gain, offset, view, most, w
     for i in range(N):
         _place_pattern(x, y, z, ray, i, rho, T)
         see(s, index, x, y, z, P * M, view, seen)
-        square[:], total[:] = ZERO, ZERO
         whole = ZERO
+        for m in range(M):
+            square[m], total[m] = ZERO, ZERO
         for p in range(P):
             whole += weight[i, p]
             _add_squares(seen, p * M, M, gain * reference[i, p] + offset, weight[i, p], most, square, total)

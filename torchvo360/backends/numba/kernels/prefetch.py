@@ -1,4 +1,4 @@
-"""Fetching pixels into the cache before they are needed: points of a window lie far apart, and each waits for memory."""
+"""Fetching pixels into the cache before they are needed: a window's points lie far apart, and each waits for memory."""
 
 from typing import Any
 

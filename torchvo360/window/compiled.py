@@ -1,12 +1,9 @@
-"""Edges by the compiled pass, and the points' elimination: tensors to arrays and back.
+"""Edges by the compiled pass: tensors to arrays, one call a keyframe, and back.
 
 The pass runs on one thread and lets others run Python meanwhile.
 """
 
-import functools
-import importlib
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 import torch
@@ -14,20 +11,16 @@ from jaxtyping import Float, Float64
 from torch import Tensor
 
 from torchvo360.backends import use_numba
-from torchvo360.backends.numba.linearize import intrinsics_of, loss_of, optics_of
+from torchvo360.backends.numba.linearize import intrinsics_of, kernel, loss_of, optics_of
 from torchvo360.cameras import Equirectangular, Pinhole
 from torchvo360.residuals.direct import Target
-from torchvo360.solve import schur
-from torchvo360.solve.schur import Reduced
 from torchvo360.window.config import WindowConfig
 from torchvo360.window.edges import KeyframeSums, PointSums
 from torchvo360.window.pattern import PATTERN
 from torchvo360.window.points import WindowPoints
-from torchvo360.window.state import PER_FRAME, Estimate
+from torchvo360.window.state import Estimate
 from torchvo360.window.thresholds import find_threshold
 
-TILE = 4
-"""Unknowns that the elimination takes together."""
 NO_IMAGE, NO_POSES = np.empty((0, 0), np.float32), np.empty((0, 4, 4))
 NO_SUMS = np.empty((0, 0)), np.empty((0, 9, 9))
 MEANS, RANGES, ALL = 0, 1, 2
@@ -62,7 +55,7 @@ def sum_edges(
     keyframes: bool,
 ) -> tuple[PointSums, KeyframeSums | None]:
     """Evaluate and linearise all edges as `edges.sum_edges` does."""
-    kernels = _kernels("edges")
+    kernels = kernel("edges")
     N, P = points.value.shape
     K = len(targets)
     T, affine = _array(estimate.T_cam_world), _array(estimate.affine)
@@ -72,74 +65,33 @@ def sum_edges(
     sums, means = np.zeros((4, N)), np.empty(N, np.float32)
     cross, M = NO_SUMS
     if keyframes:
-        cross, M = np.zeros((PER_FRAME * K, N)), np.zeros((K, K, 9, 9))
-    edges, limits = 0, np.zeros(K, np.float32)
+        cross, M = kernels.begin_cross(K, packed), np.zeros((K, K, 9, 9))
+    edges, limits, optics = 0, np.zeros(K, np.float32), {}
     if thresholds is not None:
         limits[:] = thresholds[:K].numpy()
     for j, target in enumerate(targets):
         if counts[j] == N:
             continue
+        if target.camera not in optics:
+            optics[target.camera] = intrinsics_of(target)[0], optics_of(target)
         confidence = NO_IMAGE if target.confidence is None else _array(target.confidence[0, 0])
         image = _array(target.padded[0, 0]), confidence
-        camera = intrinsics_of(target)[0], optics_of(target), loss_of(config.loss, target.saturation, 0.0)
-        arguments = packed, T, at, affine, image, *camera, means, sums, cross, M[j] if keyframes else M
+        loss = loss_of(config.loss, target.saturation, 0.0)
+        outputs = means, sums, cross, M[j] if keyframes else M
+        arguments = packed, T, at, affine, image, *optics[target.camera], loss, *outputs
         if thresholds is None:
             means.fill(-1)
             kernels.add_target(j, P, MEANS, limits[j], *arguments)
             limits[j] = float(find_threshold(torch.from_numpy(means[means >= 0]), config))
         edges += kernels.add_target(j, P, ALL if keyframes else RANGES, limits[j], *arguments)
-    curvature, slope, energy, inliers = torch.from_numpy(sums)
+    total = torch.from_numpy(sums)
+    curvature, slope, energy, inliers = total.unbind()
     of_points = PointSums(curvature, slope, energy, inliers.to(estimate.rho), edges, list(torch.from_numpy(limits)))
     if not keyframes:
         return of_points, None
-    H, g = _kernels("normal").assemble(M, T if T_first is None else at, affine)
+    H, g = kernel("normal").assemble(M, T if T_first is None else at, affine)
     return of_points, KeyframeSums(torch.from_numpy(H), torch.from_numpy(g), torch.from_numpy(cross).T)
-
-
-def reduce(
-    H: Float64[Tensor, "D D"],
-    g: Float64[Tensor, "D"],
-    cross: Float64[Tensor, "N D"],
-    diagonal: Float64[Tensor, "N"],
-    slope: Float64[Tensor, "N"],
-) -> Reduced:
-    """Eliminate the points as `schur.reduce` does; infinite ones of the diagonal leave theirs out."""
-    if not _serves_cross(cross):
-        return schur.reduce(H, g, cross, diagonal, slope)
-    A, b = _kernels("normal").eliminate_points(cross.mT.numpy(), _array(diagonal), _array(slope))
-    return Reduced(H - torch.from_numpy(A), torch.from_numpy(b) - g)
-
-
-def back_substitute(
-    x: Float64[Tensor, "D"],
-    cross: Float64[Tensor, "N D"],
-    diagonal: Float64[Tensor, "N"],
-    slope: Float64[Tensor, "N"],
-) -> Float64[Tensor, "N"]:
-    """Return the points' step as `schur.back_substitute` does."""
-    if not _serves_cross(cross):
-        return schur.back_substitute(x, cross, diagonal, slope)
-    return torch.from_numpy(
-        _kernels("normal").step_points(_array(x), cross.mT.numpy(), _array(diagonal), _array(slope))
-    )
-
-
-def _serves_cross(cross: Tensor) -> bool:
-    """Return whether these are the mixed derivatives that the compiled pass left: unknown by unknown."""
-    return (
-        cross.dtype == torch.float64
-        and cross.mT.is_contiguous()
-        and cross.shape[1] % TILE == 0
-        and len(cross) > 1
-        and use_numba(cross)
-    )
 
 
 def _array(value: Tensor) -> np.ndarray:
     return value.detach().contiguous().numpy()
-
-
-@functools.cache
-def _kernels(name: str) -> Any:
-    """Import what numba has compiled, at the first call alone."""
-    return importlib.import_module(f"torchvo360.backends.numba.kernels.{name}")

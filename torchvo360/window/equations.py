@@ -12,8 +12,8 @@ from torchvo360.checks import InputError
 from torchvo360.residuals.direct import Target
 from torchvo360.solve import solve_ldl
 from torchvo360.window.calibration import prior_weights
-from torchvo360.window.compiled import back_substitute, reduce
 from torchvo360.window.config import MIN_KEYFRAMES, WindowConfig
+from torchvo360.window.elimination import back_substitute, reduce
 from torchvo360.window.energy import linearize_window
 from torchvo360.window.inertial import Coupling, linearize_coupling
 from torchvo360.window.layout import Layout

@@ -6,8 +6,8 @@ import torch
 from jaxtyping import Float64, Int64
 from torch import Tensor
 
-from torchvo360 import lie
 from torchvo360.window.layout import Layout
+from torchvo360.window.poses import steps_between
 from torchvo360.window.state import METRIC, PER_FRAME, POSE, Estimate, Metric, WindowFrame
 from torchvo360.window.system import LEAST_CURVATURE
 
@@ -43,7 +43,7 @@ def difference(frames: list[WindowFrame], estimate: Estimate, first: First) -> F
         at = torch.tensor([place for place, ok in enumerate(held) if ok])
         T_first = torch.stack([f.T_first for f in frames if f.T_first is not None])
         affine_first = torch.stack([f.affine_first for f in frames if f.affine_first is not None])
-        out[at, :POSE] = lie.se3_log(estimate.T_cam_world[at] @ lie.se3_inverse(T_first))
+        out[at, :POSE] = steps_between(estimate.T_cam_world[at], T_first)
         out[at, POSE:] = estimate.affine[at] - affine_first
     parts, k = [out.flatten()], estimate.intrinsics
     if k is not None:

@@ -7,9 +7,9 @@ import torch
 from jaxtyping import Float, Float64
 from torch import Tensor
 
-from torchvo360 import lie
 from torchvo360.residuals.direct import Target
 from torchvo360.residuals.inertial import turn_gravity
+from torchvo360.window.poses import move_poses
 
 POSE, PER_FRAME = 6, 8
 """A keyframe has a pose (v, w) and a brightness (a, b)."""
@@ -62,7 +62,7 @@ class Estimate(NamedTuple):
         each = step[: PER_FRAME * K].view(K, PER_FRAME)
         limit = 0.5 * self.rho.double().clamp_min(0.02 * float(self.rho.median()) if len(self.rho) else 0.0)
         rho = (self.rho.double() + torch.clamp(rho_step, -limit, limit)).clamp_min(0.0)
-        T = lie.se3_exp(each[:, :POSE]) @ self.T_cam_world
+        T = move_poses(self.T_cam_world, each[:, :POSE])
         k, motion, metric, rest = self.intrinsics, self.motion, self.metric, step[PER_FRAME * K :]
         if k is not None:
             k, rest = k + rest[: len(k)], rest[len(k) :]

@@ -11,7 +11,7 @@ from torchvo360 import lie
 from torchvo360.checks import InputError
 from torchvo360.residuals.inertial import Preintegrated
 from torchvo360.window.calibration import at_intrinsics, intrinsics_of, unit_rays
-from torchvo360.window.compiled import reduce
+from torchvo360.window.elimination import reduce
 from torchvo360.window.equations import GAUGE_WEIGHT, WindowEquations
 from torchvo360.window.inertial import Coupling, linearize_coupling
 from torchvo360.window.layout import Layout

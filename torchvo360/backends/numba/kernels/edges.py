@@ -113,6 +113,18 @@ def pack(ray, rho, value, weight, host, affine):
     return (samples, own, blocks), count
 
 
+@compiled(nogil=True)
+def begin_cross(K, points):
+    """Return [8 K, N], zero in the rows of the points' hosts; the others are for `add_target` to write."""
+    _, _, blocks = points
+    cross = np.empty((8 * K, blocks[-1, 2] if len(blocks) else 0))
+    for b in range(len(blocks)):
+        for c in range(8 * blocks[b, 0], 8 * blocks[b, 0] + 8):
+            for i in range(blocks[b, 1], blocks[b, 2]):
+                cross[c, i] = 0.0
+    return cross
+
+
 @compiled()
 def relate(T_target, T_host, out):
     """Write T_target inv(T_host)."""

@@ -123,6 +123,7 @@ def scale_rows(cross, root, rows, first, n):
 
 @compiled(fastmath=FAST)
 def dot(x, y, n):
+    """Return the sum of products."""
     total = 0.0
     for i in range(n):
         total += x[i] * y[i]

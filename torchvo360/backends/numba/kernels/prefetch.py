@@ -1,4 +1,4 @@
-"""Fetching pixels into the cache before they are needed: points of a window lie far apart, and each waits for memory."""
+"""Fetching pixels into the cache before they are needed: a window's points lie far apart, and each waits for memory."""
 
 from typing import Any
 
@@ -14,8 +14,7 @@ READ, KEEP, DATA = 0, 3, 1
 """As LLVM's `prefetch` takes them: to read, in all caches, not as instructions."""
 
 
-@intrinsic
-def fetch(typing_context: Any, array: Any, index: Any) -> Any:
+def _fetch(typing_context: Any, array: Any, index: Any) -> Any:
     """Ask for an element's cache line, without waiting; any index will do."""
 
     def generate(context: Any, builder: Any, signature: Any, values: Any) -> Any:
@@ -28,6 +27,9 @@ def fetch(typing_context: Any, array: Any, index: Any) -> Any:
         return context.get_dummy_value()
 
     return types.void(array, index), generate
+
+
+fetch: Any = intrinsic(_fetch)
 
 
 @compiled()

@@ -396,3 +396,61 @@ class TestSmoothing:
             smooth_trajectory(t_ns.flip(0), truth, R)
         with pytest.raises(InputError, match="T_world_cam: expected rigid motions"):
             smooth_trajectory(t_ns, 2 * truth, R)
+
+
+class TestSingleState:
+    """One state alone is computed in NumPy: it must come out as in a batch."""
+
+    TURNS = (0.0, 1e-9, 1e-3, 9.9e-3, 1.01e-2, 0.3, 2.0, math.pi - 1e-6)
+
+    @pytest.mark.parametrize("turn", TURNS)
+    @pytest.mark.parametrize("dt", [0.0, 1 / 30, 5.0])
+    def test_its_prediction_is_that_of_a_batch(self, turn: float, dt: float) -> None:
+        motion, state = PoseFilter(), random_state((), seed=20)
+        twist = torch.cat([state.twist[:3], torch.nn.functional.normalize(state.twist[3:], dim=0) * turn / max(dt, 1)])
+        state = PoseState(state.T_cam_key, twist, state.covariance, 3.0)
+        two = PoseState(*(torch.stack([v] * 2) for v in (state.T_cam_key, state.twist, state.covariance)), 3.0)
+        many, one = motion.predict(two, dt), motion.predict(state, dt)
+        scale = float(many.covariance.abs().max())
+        torch.testing.assert_close(one.T_cam_key, many.T_cam_key[0], rtol=0, atol=1e-12)
+        torch.testing.assert_close(one.covariance, many.covariance[0], rtol=0, atol=1e-12 * scale)
+        assert torch.equal(one.covariance, one.covariance.mT)
+
+    @pytest.mark.parametrize("turn", TURNS)
+    def test_its_correction_is_that_of_a_batch(self, turn: float) -> None:
+        motion, state = PoseFilter(), random_state((), seed=21)
+        axis = torch.nn.functional.normalize(tangent(0, 0, 0, 1, -2, 0.5), dim=0)
+        measured = lie.se3_exp(axis * turn + tangent(0.2, 0.1, -0.3, 0, 0, 0)) @ state.T_cam_key
+        two = PoseState(*(torch.stack([v] * 2) for v in (state.T_cam_key, state.twist, state.covariance)), 2.0)
+        (many, seen), (one, own) = motion.update(two, measured.expand(2, 4, 4), R), motion.update(state, measured, R)
+        assert_states_close(one, PoseState(many.T_cam_key[0], many.twist[0], many.covariance[0], 2.0), atol=1e-11)
+        torch.testing.assert_close(own.residual, seen.residual[0], rtol=0, atol=1e-11)
+        torch.testing.assert_close(own.covariance, seen.covariance[0], rtol=0, atol=1e-14)
+        torch.testing.assert_close(own.mahalanobis2, seen.mahalanobis2[0], rtol=1e-9, atol=1e-9)
+        assert bool(own.ok)
+
+    @pytest.mark.parametrize("fault", ["pose", "skew pose", "mirrored pose", "covariance", "negative covariance"])
+    def test_it_keeps_its_prediction_where_the_measurement_fails(self, fault: str) -> None:
+        motion, state = PoseFilter(), random_state((), seed=22)
+        measured, covariance = state.T_cam_key.clone(), R.clone()
+        if fault == "pose":
+            measured[0, 3] = math.nan
+        elif fault == "skew pose":
+            measured[:3, :3] = 0
+        elif fault == "mirrored pose":
+            measured[:3, :3] *= -1
+        else:
+            covariance = torch.full_like(R, math.inf) if fault == "covariance" else -1e3 * torch.eye(6, dtype=F64)
+        found, innovation = motion.update(state, measured, covariance)
+        assert_states_close(found, state, atol=0)
+        assert not bool(innovation.ok)
+        assert float(innovation.mahalanobis2) == math.inf
+        assert bool(torch.isfinite(innovation.covariance).all())
+        assert not bool(motion.plausible(innovation))
+
+    def test_it_has_derivatives_where_they_are_asked_for(self) -> None:
+        motion, state = PoseFilter(), random_state((), seed=23)
+        twist = state.twist.clone().requires_grad_()
+        moved = motion.predict(PoseState(state.T_cam_key, twist, state.covariance, 2.0), 0.1)
+        (gradient,) = torch.autograd.grad(moved.T_cam_key.sum(), twist)
+        assert float(gradient.abs().max()) > 0

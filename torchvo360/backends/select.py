@@ -62,7 +62,12 @@ def use_numba(*tensors: Tensor | None) -> bool:
     It serves what is on the CPU and asks for no derivative: neither backwards, nor forwards, nor by `torch.func`; and
     not what `torch.compile` compiles.
     """
-    if _in_transform() or _asked == "eager" or not has_numba():
+    return _asked != "eager" and has_numba() and are_plain(*tensors)
+
+
+def are_plain(*tensors: Tensor | None) -> bool:
+    """Return whether tensors are numbers on the CPU that ask for no derivative, so that NumPy and numba may have them."""
+    if _in_transform():
         return False
     gradients = torch.is_grad_enabled()
     return all(

@@ -10,12 +10,15 @@ error lives in the camera's axes, as the alignment's covariance does, so that a 
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
+import numpy as np
 import torch
 from jaxtyping import Bool, Float64, Int64
 from torch import Tensor
 
 from torchvo360 import lie
+from torchvo360.backends import are_plain
 from torchvo360.checks import InputError, check_finite_number, check_pose, check_shape, is_pose
+from torchvo360.motion import single
 from torchvo360.motion.kalman import (
     Gaussian,
     Innovation,
@@ -140,10 +143,15 @@ class PoseFilter:
         Raises:
             InputError: A time is negative or not finite.
         """
+        if isinstance(dt_s, float) and dt_s >= 0 and _is_single(state):
+            T, twist, P = (value.numpy() for value in (state.T_cam_key, state.twist, state.covariance))
+            if single.angle(twist) * dt_s <= single.MOST_TURN:
+                moved, covariance = single.predicted(T, twist, P, dt_s, np.array(self._density2(state)))
+                return PoseState(torch.from_numpy(moved), state.twist, torch.from_numpy(covariance), state.median_range)
         dt = torch.as_tensor(dt_s, dtype=state.twist.dtype, device=state.twist.device)
         if not bool((torch.isfinite(dt) & (dt >= 0)).all()):
             raise InputError(f"dt_s: expected finite numbers of at least 0, got {dt_s}.")
-        F, Q = transition(state.twist, dt, self._density2(state))
+        F, Q = transition(state.twist, dt, state.twist.new_tensor(self._density2(state)))
         T = _moved(state.T_cam_key, state.twist * dt[..., None])
         twist = state.twist.expand(*T.shape[:-2], 6)
         return PoseState(T, twist, symmetrized(F @ state.covariance @ F.mT + Q), state.median_range)
@@ -163,6 +171,8 @@ class PoseFilter:
         """
         check_shape("T_measured", T_measured, "... 4 4")
         check_shape("covariance", covariance, "... 6 6")
+        if T_measured.ndim == 2 and covariance.ndim == 2 and _is_single(state) and are_plain(T_measured, covariance):
+            return _updated(state, T_measured.double(), covariance.double())
         T_measured = T_measured.double()
         valid = is_pose(T_measured)
         # The logarithm of what is no pose would leave NaN in the gradients: the element fails by its residual instead.
@@ -178,9 +188,9 @@ class PoseFilter:
         """Return which measurements the motion so far makes credible: those within the gate."""
         return innovation.ok & (innovation.mahalanobis2 <= self.config.gate)
 
-    def _density2(self, state: PoseState) -> Float64[Tensor, "6"]:
+    def _density2(self, state: PoseState) -> list[float]:
         linear = (self.config.acceleration * state.median_range) ** 2
-        return state.twist.new_tensor([linear] * 3 + [self.config.turn_acceleration**2] * 3)
+        return [linear] * 3 + [self.config.turn_acceleration**2] * 3
 
 
 class SmoothTrajectory(NamedTuple):
@@ -231,7 +241,7 @@ def smooth_trajectory(
         predicted.append(motion.predict(filtered[-1], dt_s[k - 1]))
         filtered.append(motion.update(predicted[-1], measured[k], covariance[k])[0])
     P = torch.stack([state.covariance for state in filtered[:-1]])
-    F, Q = transition(torch.stack([state.twist for state in filtered[:-1]]), dt_s, motion._density2(filtered[0]))
+    F, Q = transition(torch.stack([state.twist for state in filtered[:-1]]), dt_s, P.new_tensor(motion._density2(filtered[0])))
     gain, _ = smoothing_gain(P, F, Q)
     states = [filtered[-1]]
     for k in range(N - 2, -1, -1):
@@ -312,6 +322,22 @@ def _injected(state: PoseState, error: Gaussian) -> PoseState:
         _carried(error.covariance, xi),
         state.median_range,
     )
+
+
+def _is_single(state: PoseState) -> bool:
+    """Return whether NumPy may take a step of a state: there is one alone, and nobody asks for its derivatives."""
+    return state.twist.ndim == 1 and are_plain(state.T_cam_key, state.twist, state.covariance)
+
+
+def _updated(
+    state: PoseState, T_measured: Float64[Tensor, "4 4"], covariance: Float64[Tensor, "6 6"]
+) -> tuple[PoseState, Innovation]:
+    """Correct one state in NumPy."""
+    given = (state.T_cam_key, state.twist, state.covariance, T_measured, covariance)
+    new = single.updated(*(value.numpy() for value in given))
+    T, twist, P, residual, S = (torch.from_numpy(value) for value in new[:5])
+    distance = torch.tensor(new.mahalanobis2, dtype=torch.float64)
+    return PoseState(T, twist, P, state.median_range), Innovation(residual, S, distance, torch.tensor(new.ok))
 
 
 def _range(median_range: float) -> float:

@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass, field
 
+import numpy as np
 import torch
 from jaxtyping import Float64
 from torch import Tensor
@@ -9,6 +10,7 @@ from torch import Tensor
 from torchvo360 import lie
 from torchvo360.alignment import PosePrior
 from torchvo360.motion import PoseFilter, PoseState
+from torchvo360.motion.single import normalized
 from torchvo360.vo.frame import PyramidFrame
 from torchvo360.vo.inertial import InertialLink, Place
 from torchvo360.vo.keyframes.keyframe import Keyframe
@@ -21,6 +23,11 @@ MAX_PREDICTED = 10
 
 def _identity() -> Float64[Tensor, "4 4"]:
     return torch.eye(4, dtype=torch.float64)
+
+
+def _normalized(poses: list[Float64[Tensor, "4 4"]]) -> Float64[Tensor, "K 4 4"]:
+    """Bring products of poses back to rigid motions: `lie.se3_normalized`, at a fraction of its calls for a few."""
+    return torch.from_numpy(np.stack([normalized(T.numpy()) for T in poses]))
 
 
 @dataclass(frozen=True)
@@ -84,7 +91,7 @@ class Foresight:
                 hypotheses.insert(0, foreseen.T_cam_world @ key.T_world_key)
                 prior = self.imu.prior(foreseen, lie.se3_inverse(key.T_world_key))
                 carried = foreseen.placed and dt_s <= self.imu.config.max_bridge_s
-        return Expected(lie.se3_normalized(torch.stack(hypotheses)), prior, carried, state)
+        return Expected(_normalized(hypotheses), prior, carried, state)
 
     def corrected(self, expected: Expected, found: Track) -> PoseState | None:
         """Return the filter's state with a frame that was found; None where it is beyond the gate, or there is none."""

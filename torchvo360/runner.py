@@ -18,6 +18,7 @@ from tqdm import tqdm
 
 from torchvo360.checks import InputError
 from torchvo360.data import Frame, Trajectory
+from torchvo360.data.prefetch import prefetched
 from torchvo360.data.tum import read_tum
 from torchvo360.evaluation import evaluate
 from torchvo360.learn.checkpoint import SHIPPED_DEPTH, load_checkpoint
@@ -197,29 +198,29 @@ def _step_through(
     began = time.perf_counter()
     problems: Counter[str] = Counter()
     count = 0
-    frames = iter(sequence)
-    opening = list(itertools.islice(frames, 2))
-    if truth is not None:
-        _check_overlap("truth", "poses", truth.t_ns, opening, sequence.length)
-    if opened.imu is not None:
-        t_ns = opened.imu.samples.t_ns + round(1e9 * opened.imu.offset_s)
-        _check_overlap("imu", "samples", t_ns, opening, sequence.length)
-    disable = None if progress else True  # None: where standard error is no terminal
-    with tqdm(total=sequence.length, desc=sequence.name, unit="frame", disable=disable, leave=False) as bar:
-        for frame in itertools.chain(opening, frames):
-            estimate = odometry.step(frame)
-            count += 1
-            problems.update([frame.problem] if frame.problem else [])
-            if pictures is not None:
-                pictures.add(frame)
-            if live is not None:
-                live.show(frame, estimate)
-                if count % MAP_EVERY == 0:
-                    live.show_map(odometry.finish())
-            bar.set_postfix_str(estimate.state, refresh=False)
-            bar.update()
-            if stop.received:
-                break
+    with prefetched(sequence) as frames:
+        opening = list(itertools.islice(frames, 2))
+        if truth is not None:
+            _check_overlap("truth", "poses", truth.t_ns, opening, sequence.length)
+        if opened.imu is not None:
+            t_ns = opened.imu.samples.t_ns + round(1e9 * opened.imu.offset_s)
+            _check_overlap("imu", "samples", t_ns, opening, sequence.length)
+        disable = None if progress else True  # None: where standard error is no terminal
+        with tqdm(total=sequence.length, desc=sequence.name, unit="frame", disable=disable, leave=False) as bar:
+            for frame in itertools.chain(opening, frames):
+                estimate = odometry.step(frame)
+                count += 1
+                problems.update([frame.problem] if frame.problem else [])
+                if pictures is not None:
+                    pictures.add(frame)
+                if live is not None:
+                    live.show(frame, estimate)
+                    if count % MAP_EVERY == 0:
+                        live.show_map(odometry.finish())
+                bar.set_postfix_str(estimate.state, refresh=False)
+                bar.update()
+                if stop.received:
+                    break
     return Journey(count, problems, time.perf_counter() - began)
 
 

@@ -1,9 +1,11 @@
 """The frames' images that a page shows: few enough for a file, and spread evenly over a run of unknown length.
 
 Every n-th frame is kept. Whenever there are too many of them, every other one is dropped and n doubles, so that memory
-and time are bounded: of N frames, about `most` log2(N / most) are encoded in all.
+and time are bounded: of N frames, about `most` log2(N / most) are encoded in all. A second thread encodes them.
 """
 
+from collections import deque
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 
 import cv2
@@ -61,9 +63,20 @@ class Pictures:
         self._seen = 0
         self._kept: list[Picture] = []
         self._bytes = 0
+        self._worker = ThreadPoolExecutor(1, "torchvo360-pictures")
+        self._jobs: deque[Future[None]] = deque()
 
     def add(self, frame: Frame) -> None:
         """Keep the picture of a frame if it is its turn; a frame that cannot be used has none."""
+        self._finish(wait=False)
+        self._jobs.append(self._worker.submit(self._add, frame))
+
+    def _finish(self, *, wait: bool) -> None:
+        """Raise what befell earlier frames' pictures; of all of them, if it waits."""
+        while self._jobs and (wait or self._jobs[0].done()):
+            self._jobs.popleft().result()
+
+    def _add(self, frame: Frame) -> None:
         turn = self._seen % self._stride == 0
         self._seen += 1
         if not turn or frame.image is None or frame.problem:
@@ -79,4 +92,5 @@ class Pictures:
     @property
     def kept(self) -> list[Picture]:
         """The pictures so far, in the order of their frames."""
+        self._finish(wait=True)
         return list(self._kept)

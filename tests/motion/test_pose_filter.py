@@ -398,6 +398,11 @@ class TestSmoothing:
             smooth_trajectory(t_ns, 2 * truth, R)
 
 
+def twice(state: PoseState) -> PoseState:
+    T, twist, covariance = (torch.stack([value] * 2) for value in (state.T_cam_key, state.twist, state.covariance))
+    return PoseState(T, twist, covariance, state.median_range)
+
+
 class TestSingleState:
     """One state alone is computed in NumPy: it must come out as in a batch."""
 
@@ -409,8 +414,7 @@ class TestSingleState:
         motion, state = PoseFilter(), random_state((), seed=20)
         twist = torch.cat([state.twist[:3], torch.nn.functional.normalize(state.twist[3:], dim=0) * turn / max(dt, 1)])
         state = PoseState(state.T_cam_key, twist, state.covariance, 3.0)
-        two = PoseState(*(torch.stack([v] * 2) for v in (state.T_cam_key, state.twist, state.covariance)), 3.0)
-        many, one = motion.predict(two, dt), motion.predict(state, dt)
+        many, one = motion.predict(twice(state), dt), motion.predict(state, dt)
         scale = float(many.covariance.abs().max())
         torch.testing.assert_close(one.T_cam_key, many.T_cam_key[0], rtol=0, atol=1e-12)
         torch.testing.assert_close(one.covariance, many.covariance[0], rtol=0, atol=1e-12 * scale)
@@ -421,8 +425,8 @@ class TestSingleState:
         motion, state = PoseFilter(), random_state((), seed=21)
         axis = torch.nn.functional.normalize(tangent(0, 0, 0, 1, -2, 0.5), dim=0)
         measured = lie.se3_exp(axis * turn + tangent(0.2, 0.1, -0.3, 0, 0, 0)) @ state.T_cam_key
-        two = PoseState(*(torch.stack([v] * 2) for v in (state.T_cam_key, state.twist, state.covariance)), 2.0)
-        (many, seen), (one, own) = motion.update(two, measured.expand(2, 4, 4), R), motion.update(state, measured, R)
+        many, seen = motion.update(twice(state), measured.expand(2, 4, 4), R)
+        one, own = motion.update(state, measured, R)
         assert_states_close(one, PoseState(many.T_cam_key[0], many.twist[0], many.covariance[0], 2.0), atol=1e-11)
         torch.testing.assert_close(own.residual, seen.residual[0], rtol=0, atol=1e-11)
         torch.testing.assert_close(own.covariance, seen.covariance[0], rtol=0, atol=1e-14)

@@ -66,7 +66,7 @@ def use_numba(*tensors: Tensor | None) -> bool:
 
 
 def are_plain(*tensors: Tensor | None) -> bool:
-    """Return whether tensors are numbers on the CPU that ask for no derivative, so that NumPy and numba may have them."""
+    """Return whether tensors are numbers on the CPU that ask for no derivative: NumPy and numba may have them."""
     if _in_transform():
         return False
     gradients = torch.is_grad_enabled()

@@ -241,7 +241,8 @@ def smooth_trajectory(
         predicted.append(motion.predict(filtered[-1], dt_s[k - 1]))
         filtered.append(motion.update(predicted[-1], measured[k], covariance[k])[0])
     P = torch.stack([state.covariance for state in filtered[:-1]])
-    F, Q = transition(torch.stack([state.twist for state in filtered[:-1]]), dt_s, P.new_tensor(motion._density2(filtered[0])))
+    twist, density2 = torch.stack([state.twist for state in filtered[:-1]]), motion._density2(filtered[0])
+    F, Q = transition(twist, dt_s, P.new_tensor(density2))
     gain, _ = smoothing_gain(P, F, Q)
     states = [filtered[-1]]
     for k in range(N - 2, -1, -1):

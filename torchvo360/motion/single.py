@@ -1,6 +1,6 @@
-"""The filter's two steps for one state in NumPy: every frame takes them, and in torch their hundreds of calls cost all.
+"""The filter's two steps for one state in NumPy: every frame takes them, and in torch hundreds of calls cost it all.
 
-The formulas are those of `pose_filter` (whose names they have), without batches and derivatives. The transition needs no
+The formulas are those of `pose_filter`, by the same names, without batches and derivatives. The transition needs no
 exponential of a large matrix: every power of ad(twist) from the fifth on is made of the four below, so that a series in
 it is five matrices and five sums of numbers.
 

@@ -15,6 +15,7 @@ Source: Engel, Schoeps and Cremers, LSD-SLAM (2014), section 3.5, there one way,
 """
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import NamedTuple
 
 import torch
@@ -54,11 +55,22 @@ class LevelPair:
 
     def ranges(self, S_b_a: Float64[Tensor, "K 4 4"]) -> tuple[RangePairs, RangePairs]:
         """Return the comparisons of A's points in B, and of B's in A, with derivatives by a step of S_b_a for both."""
-        a, b = (_range_points(points) for points in (self.points_a, self.points_b))
         S_a_b = lie.sim3_inverse(S_b_a)
-        forward = pair_ranges(a.thinned(self.range_points), b, S_b_a)
-        backward = pair_ranges(b.thinned(self.range_points), a, S_a_b)
-        return forward, backward._replace(J=backward.J @ -lie.sim3_adjoint(S_a_b).to(backward.J))
+        return self.ranges_both_ways(S_b_a, S_a_b, -lie.sim3_adjoint(S_a_b))
+
+    def ranges_both_ways(
+        self, S_b_a: Float64[Tensor, "K 4 4"], S_a_b: Float64[Tensor, "K 4 4"], J_back: Float64[Tensor, "K 7 7"]
+    ) -> tuple[RangePairs, RangePairs]:
+        """Return what `ranges` does, given the inverse and its step by one of S_b_a, -Ad(S_a_b)."""
+        a, b, some_a, some_b = self._range_points
+        backward = pair_ranges(some_b, a, S_a_b)
+        return pair_ranges(some_a, b, S_b_a), backward._replace(J=backward.J @ J_back.to(backward.J))
+
+    @cached_property
+    def _range_points(self) -> tuple[RangePoints, RangePoints, RangePoints, RangePoints]:
+        """All of A's and B's, and those of A and B that are compared."""
+        a, b = (_range_points(points) for points in (self.points_a, self.points_b))
+        return a, b, a.thinned(self.range_points), b.thinned(self.range_points)
 
 
 def _range_points(points: Reference) -> RangePoints:
@@ -99,23 +111,6 @@ def directions(
     )
 
 
-def _photometric(
-    points: Reference,
-    image: Target,
-    S: Float64[Tensor, "K 4 4"],
-    affine: Float64[Tensor, "K 2"],
-    loss: LossConfig,
-    noise: float,
-) -> tuple[NormalEquations, Float64[Tensor, "K 6 7"]]:
-    """Return one direction's equations by its rigid step and brightness, and how a step of S moves that rigid step."""
-    T, scale = rigid(S)
-    index = torch.zeros(S.shape[0], dtype=torch.int64, device=S.device)
-    equations = linearize(points.take(index), image.take(index), T, affine, loss, noise=noise)
-    chain = torch.eye(6, 7, dtype=S.dtype, device=S.device).repeat(S.shape[0], 1, 1)
-    chain[:, :3] /= scale[:, None, None]
-    return equations, chain
-
-
 def linearize_similarity(
     pair: LevelPair,
     S_b_a: Float64[Tensor, "K 4 4"],
@@ -137,33 +132,35 @@ def linearize_similarity(
     """
     K = S_b_a.shape[0]
     S_a_b = lie.sim3_inverse(S_b_a)
-    carried = -lie.sim3_adjoint(S_a_b)
-    H = S_b_a.new_zeros(K, 11, 11)
-    g, cost, weight, square = S_b_a.new_zeros(K, 11), S_b_a.new_zeros(K), S_b_a.new_zeros(K), S_b_a.new_zeros(K)
-    for k, (points, image, S) in enumerate(
-        ((pair.points_a, pair.image_b, S_b_a), (pair.points_b, pair.image_a, S_a_b))
-    ):
-        own = slice(2 * k, 2 * k + 2)
-        equations, chain = _photometric(points, image, S, affine[:, own], loss, noise)
-        J = S_b_a.new_zeros(K, 8, 11)
-        J[:, :6, :7] = chain if k == 0 else chain @ carried
-        J[:, 6:, 7 + 2 * k : 9 + 2 * k] = torch.eye(2, dtype=J.dtype, device=J.device)
-        H = H + J.mT @ equations.H @ J / noise**2
-        g = g + (J.mT @ equations.g[..., None])[..., 0] / noise**2
-        cost, square = cost + equations.cost / noise**2, square + equations.square / noise**2
-        weight = weight + equations.weight
-    for ranges in pair.ranges(S_b_a):
-        root = ranges.weight.sqrt()
-        w, c = robust(ranges.difference * root, RANGE_LOSS)
-        paired = ranges.weight > 0
-        total = (ranges.weight * w).double()
-        weighted = ranges.J.double() * total[..., None]
-        H[:, :7, :7] += weighted.mT @ ranges.J.double()
-        g[:, :7] += (weighted.mT @ ranges.difference.double()[..., None])[..., 0]
-        cost = cost + (c * paired).sum(-1, dtype=torch.float64)
-        square = square + (total * ranges.difference.square()).sum(-1)
-        weight = weight + paired.sum(-1)
-    return NormalEquations(H, g, cost, weight, square)
+    J_back = -lie.sim3_adjoint(S_a_b)
+    ways = ((pair.points_a, pair.image_b, affine[:, :2]), (pair.points_b, pair.image_a, affine[:, 2:]))
+    both, scales = rigid(torch.stack([S_b_a, S_a_b]).flatten(0, 1))
+    found = [
+        linearize(points.repeated(K), image.repeated(K), T, ab, loss, noise=noise)
+        for (points, image, ab), T in zip(ways, both.split(K), strict=True)
+    ]
+    # How a step of S moves either rigid step, whose translation is in the scale of the frame it starts from.
+    J = S_b_a.new_zeros(2, K, 8, 11)
+    J[0, :, :6, :7] = torch.eye(6, 7, dtype=J.dtype, device=J.device)
+    J[1, :, :6, :7] = J_back[:, :6]
+    J[:, :, :3] /= scales.view(2, K, 1, 1)
+    J[0, :, 6, 7] = J[0, :, 7, 8] = J[1, :, 6, 9] = J[1, :, 7, 10] = 1.0
+    H, g, cost, weight, square = (torch.stack(parts) for parts in zip(*found, strict=True))
+    H, g = (J.mT @ H @ J).sum(0), (J.mT @ g[..., None])[..., 0].sum(0)
+    H, g, cost, square = (part / noise**2 for part in (H, g, cost.sum(0), square.sum(0)))
+
+    difference, trust, J_r = (
+        torch.cat(parts, 1) for parts in zip(*pair.ranges_both_ways(S_b_a, S_a_b, J_back), strict=True)
+    )
+    w, c = robust(difference * trust.sqrt(), RANGE_LOSS)
+    paired, total = trust > 0, (trust * w).double()
+    J_r, difference = J_r.double(), difference.double()
+    weighted = J_r * total[..., None]
+    H[:, :7, :7] += weighted.mT @ J_r
+    g[:, :7] += (weighted.mT @ difference[..., None])[..., 0]
+    cost = cost + (c * paired).sum(-1, dtype=torch.float64)
+    square = square + (total * difference.square()).sum(-1)
+    return NormalEquations(H, g, cost, weight.sum(0) + paired.sum(-1), square)
 
 
 def solve_similarity(

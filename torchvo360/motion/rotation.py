@@ -76,15 +76,11 @@ def align_rotation(
     """
     K = R_tgt_ref.shape[0]
     loss = LossConfig() if loss is None else loss
-    index = torch.zeros(K, dtype=torch.int64, device=R_tgt_ref.device)
-    points = Reference(
-        reference.ray, torch.zeros_like(reference.rho)[index], reference.value[index], reference.weight[index]
-    )
-    images = target.take(index)
+    points = Reference(reference.ray, torch.zeros_like(reference.rho), reference.value, reference.weight)
 
     def evaluate(state: tuple[Tensor, ...], active: Tensor) -> NormalEquations:
         T, affine = state
-        return linearize(points.take(active), images.take(active), T, affine, loss)
+        return linearize(points.repeated(len(active)), target.repeated(len(active)), T, affine, loss)
 
     def retract(state: tuple[Tensor, ...], delta: Tensor) -> tuple[Tensor, ...]:
         return lie.se3_exp(delta[:, :6]) @ state[0], state[1] + delta[:, 6:]
@@ -103,7 +99,9 @@ def align_rotation(
     cost = solution.equations.cost / solution.equations.weight.clamp_min(1e-9)
     order = cost.argsort(stable=True)
     T, affine = (part[order] for part in solution.state)
-    return RotationResult(T[:, :3, :3], affine, cost[order], agreeing_share(points, images, T, affine))
+    return RotationResult(
+        T[:, :3, :3], affine, cost[order], agreeing_share(points.repeated(K), target.repeated(K), T, affine)
+    )
 
 
 def search_rotation(

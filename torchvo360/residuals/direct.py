@@ -41,6 +41,12 @@ class Reference:
         variance = None if self.variance is None else self.variance[index]
         return Reference(ray, self.rho[index], self.value[index], self.weight[index], variance)
 
+    def repeated(self, count: int) -> "Reference":
+        """Return one element's points for each of a batch, without copying them."""
+        variance = None if self.variance is None else self.variance.expand(count, -1)
+        rho, weight = (part.expand(count, -1) for part in (self.rho, self.weight))
+        return Reference(self.ray, rho, self.value.expand(count, -1, -1), weight, variance)
+
     def chunk(self, start: int, stop: int) -> "Reference":
         """Return the points from start to stop of every element."""
         variance = None if self.variance is None else self.variance[:, start:stop]
@@ -71,6 +77,12 @@ class Target:
         confidence = None if self.confidence is None else self.confidence[index]
         intrinsics = None if self.intrinsics is None else self.intrinsics[index]
         return Target(self.camera, self.padded[index], confidence, self.saturation, intrinsics)
+
+    def repeated(self, count: int) -> "Target":
+        """Return one image for each of a batch, without copying it."""
+        confidence = None if self.confidence is None else self.confidence.expand(count, -1, -1, -1)
+        intrinsics = None if self.intrinsics is None else self.intrinsics.expand(count, -1)
+        return Target(self.camera, self.padded.expand(count, -1, -1, -1), confidence, self.saturation, intrinsics)
 
 
 def make_target(

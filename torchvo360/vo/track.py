@@ -1,7 +1,7 @@
 """Tracking: a frame's pose against a keyframe's points, from a batch of hypotheses, coarse to fine."""
 
 import math
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import torch
@@ -157,7 +157,7 @@ def track(
         if level == 0:
             covariance = _covariance(solution.equations, best)
     T_best, ab_best = lie.se3_normalized(T[0]).to(T_cam_key.device), ab[0].to(affine.device)
-    found = _measured(references[0], frame, T_best, ab_best)
+    found = measure(references[0], frame, T_best, ab_best)
     return found._replace(covariance=covariance.to(T_cam_key.device), steps=taken)
 
 
@@ -173,7 +173,7 @@ def measure_keyframe(key: Keyframe, config: TrackConfig, max_relative_variance: 
     index = key.trusted(max_relative_variance).nonzero()[:, 0]
     eye, none = torch.eye(4, dtype=torch.float64), torch.zeros(2, dtype=torch.float64)
     (reference,) = _references(key, index, config.points_by_level[:1])
-    return _measured(reference, key.frame, eye, none)
+    return measure(reference, key.frame, eye, none)
 
 
 def judge_points(key: KeyPoints, frame: PyramidFrame, found: Track, max_difference: float) -> None:
@@ -195,7 +195,7 @@ def judge_points(key: KeyPoints, frame: PyramidFrame, found: Track, max_differen
     key.points = InverseRange(rho, variance, (score + change * seen).clamp(WORST, BEST))
 
 
-def _measured(
+def measure(
     reference: Reference, frame: PyramidFrame, T_cam_key: Float64[Tensor, "4 4"], affine: Float64[Tensor, "2"]
 ) -> Track:
     """Return a pose with its mean absolute residual and its agreement on the finest level."""

@@ -71,7 +71,10 @@ def is_sensible(state: tuple[Tensor, ...]) -> Bool[Tensor, "B"]:
 
 def free_parameters(config: AlignConfig, device: torch.device, *, motion_only: bool = False) -> Bool[Tensor, "8"]:
     """Return which of (v, w, a, b) are estimated."""
-    return torch.arange(8, device=device) < (8 if config.affine and not motion_only else 6)
+    free = torch.ones(8, dtype=torch.bool, device=device)
+    if motion_only or not config.affine:
+        free[6:] = False
+    return free
 
 
 class PosePrior(NamedTuple):

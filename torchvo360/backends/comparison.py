@@ -9,7 +9,7 @@ from torchvo360.residuals.direct import Reference, Target, look_up
 
 
 class Comparison(NamedTuple):
-    """Samples in the target."""
+    """Samples in the target; what weighs 0 is finite, and means nothing."""
 
     residual: Float[Tensor, "B C N"]
     value: Float[Tensor, "B C N"]

@@ -1,7 +1,7 @@
 """Tracking: a frame's pose against a keyframe's points, from a batch of hypotheses, coarse to fine."""
 
 import math
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import torch
@@ -80,25 +80,23 @@ def _thinned(index: Int64[Tensor, "N"], count: int) -> Int64[Tensor, "M"]:
 
 def _references(key: KeyPoints, usable: Int64[Tensor, "N"], counts: list[int]) -> list[Reference]:
     """Return some of a keyframe's points for each level, the finest first, at most so many; batch 1."""
-    chosen: dict[int, tuple[Tensor, Reference]] = {}
-    references = []
-    for value, most in zip(key.values, counts, strict=True):
-        count = min(most, usable.numel())
-        if count not in chosen:
-            index = _thinned(usable, count)
-            chosen[count] = index, _reference(key, key.values[0], index)
-        index, points = chosen[count]
-        references.append(replace(points, value=value[index][None, None]))
-    return references
+    table = _table(key)
+    chosen = {count: table.index_select(1, _thinned(usable, count)) for count in set(counts)}
+    return [_reference(chosen[count], level) for level, count in enumerate(counts)]
 
 
-def _reference(key: KeyPoints, value: Float[Tensor, "N"], index: Int64[Tensor, "M"] | None = None) -> Reference:
-    """Return a keyframe's points, or some of them, as the alignment takes them; batch 1."""
-    ray, rho, variance = key.ray, key.points.rho, key.points.variance
-    if index is not None:
-        ray, rho, variance, value = ray[:, index], rho[index], variance[index], value[index]
+def _table(key: KeyPoints) -> Float[Tensor, "R N"]:
+    """Return all that references are made of in rows, so that points are chosen in one go."""
+    rho, variance, _ = key.points
     # Points are equal-area already: a further weight by solid angle would count it twice.
-    return Reference(ray[None], rho[None], value[None, None], torch.ones_like(rho)[None], variance[None])
+    rows = [rho, variance, torch.ones_like(rho), *key.values]
+    return torch.cat([key.ray, torch.stack(rows)])
+
+
+def _reference(table: Float[Tensor, "R M"], level: int) -> Reference:
+    """Return points of `_table` at one level as the alignment takes them; batch 1."""
+    ray, rho, variance, weight = table[None, :3], table[3:4], table[4:5], table[5:6]
+    return Reference(ray, rho, table[None, 6 + level : 7 + level], weight, variance)
 
 
 def _repeated(reference: Reference, target: Target, B: int) -> tuple[Reference, Target]:
@@ -150,16 +148,16 @@ def track(
         known = None if prior is None else PosePrior(*(part.to(device).expand(B, -1, -1) for part in prior))
         align_config = config.align_config(level == levels - 1)
         solution = solve_level(reference, target, T, ab, align_config, max_steps=steps, prior=known)
-        cost = solution.equations.cost / solution.equations.weight
-        best = int(cost.nan_to_num(nan=torch.inf).argmin()) if B > 1 else 0
+        cost = (solution.equations.cost / solution.equations.weight).nan_to_num(nan=torch.inf)
+        best = int(cost.argmin()) if B > 1 else 0
         if not math.isfinite(float(cost[best])):
             return None
-        T, ab = solution.state[0][best : best + 1], solution.state[1][best : best + 1]
+        T, ab = (part[best : best + 1] for part in solution.state)
         taken += int(solution.steps[best])
         if level == 0:
             covariance = _covariance(solution.equations, best)
     T_best, ab_best = lie.se3_normalized(T[0]).to(T_cam_key.device), ab[0].to(affine.device)
-    found = _measured(references[0], frame, T_best, ab_best)
+    found = measure(references[0], frame, T_best, ab_best)
     return found._replace(covariance=covariance.to(T_cam_key.device), steps=taken)
 
 
@@ -174,8 +172,8 @@ def measure_keyframe(key: Keyframe, config: TrackConfig, max_relative_variance: 
     """Return a keyframe as it tracks itself."""
     index = key.trusted(max_relative_variance).nonzero()[:, 0]
     eye, none = torch.eye(4, dtype=torch.float64), torch.zeros(2, dtype=torch.float64)
-    reference = _reference(key, key.values[0], _thinned(index, config.points_by_level[0]))
-    return _measured(reference, key.frame, eye, none)
+    (reference,) = _references(key, index, config.points_by_level[:1])
+    return measure(reference, key.frame, eye, none)
 
 
 def judge_points(key: KeyPoints, frame: PyramidFrame, found: Track, max_difference: float) -> None:
@@ -189,7 +187,7 @@ def judge_points(key: KeyPoints, frame: PyramidFrame, found: Track, max_differen
     """
     rho, variance, score = key.points
     T, ab = found.T_cam_key[None].to(rho.device), found.affine[None].to(rho.device)
-    met = compare(_reference(key, key.values[0]), frame.targets[0], T, ab)
+    met = compare(_reference(_table(key), 0), frame.targets[0], T, ab)
     off, seen = met.residual[0, 0].abs(), met.weight[0, 0] > 0
     used = seen & (score > 0)
     usual = float(off[used].median()) if bool(used.any()) else 0.0
@@ -197,7 +195,7 @@ def judge_points(key: KeyPoints, frame: PyramidFrame, found: Track, max_differen
     key.points = InverseRange(rho, variance, (score + change * seen).clamp(WORST, BEST))
 
 
-def _measured(
+def measure(
     reference: Reference, frame: PyramidFrame, T_cam_key: Float64[Tensor, "4 4"], affine: Float64[Tensor, "2"]
 ) -> Track:
     """Return a pose with its mean absolute residual and its agreement on the finest level."""

@@ -100,7 +100,7 @@ def _array(value: Tensor) -> np.ndarray:
     """Return a contiguous array; of what is expanded over the batch, its one element."""
     if value.stride(0) == 0:
         value = value[:1]
-    return value.detach().contiguous().numpy()
+    return value.contiguous().numpy(force=True)
 
 
 def intrinsics_of(target: Target) -> np.ndarray:

@@ -4,6 +4,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from torchvo360.backends import numba, use_numba
 from torchvo360.cameras import Camera
 from torchvo360.residuals.direct import Reference, Samples, Target, look_up
 
@@ -30,6 +31,10 @@ def agreeing_share(
         Between 0 and 1; 0 where the images have no gradient or no point is seen.
     """
     dtype = reference.value.dtype
+    if use_numba() and numba.serves(reference, target, T_tgt_ref, affine):
+        energy, explained, by_chance = numba.gradient_energy(reference, target, T_tgt_ref, affine, TOLERANCE_PX).unbind(-1)
+        energy = energy.clamp_min(torch.finfo(dtype).tiny)
+        return _beyond_chance(explained / energy, by_chance / energy).to(dtype)
     return share_beyond_chance(look_up(reference, target, T_tgt_ref.to(dtype), affine.to(dtype)), target.camera)
 
 
@@ -39,7 +44,10 @@ def share_beyond_chance(samples: Samples, camera: Camera) -> Float[Tensor, "B"]:
     total = samples.weight.sum(2, keepdim=True).clamp_min(torch.finfo(samples.weight.dtype).tiny)
     mean = (value * samples.weight).sum(2, keepdim=True) / total
     chance = share_of_samples(samples._replace(residual=value - mean), camera)
-    share = share_of_samples(samples, camera)
+    return _beyond_chance(share_of_samples(samples, camera), chance)
+
+
+def _beyond_chance(share: Float[Tensor, "B"], chance: Float[Tensor, "B"]) -> Float[Tensor, "B"]:
     return ((share - chance) / (1 - chance).clamp_min(1e-3)).clamp_min(0.0)
 
 

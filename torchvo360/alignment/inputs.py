@@ -1,4 +1,4 @@
-"""What `align` is given: checked, flattened to one batch axis, and rid of numbers that cannot be used."""
+"""What `align` is given: checked, flattened to one batch axis, and what of it can be used."""
 
 import math
 from collections.abc import Sequence
@@ -10,6 +10,7 @@ from torch import Tensor
 
 from torchvo360 import lie
 from torchvo360.alignment.level import MAX_TRANSLATION
+from torchvo360.backends import use_numba
 from torchvo360.cameras import Camera
 from torchvo360.checks import InputError, check_same_device, check_shape, is_pose
 
@@ -22,20 +23,23 @@ Maps = Tensor | Sequence[Tensor]
 
 @dataclass(frozen=True)
 class Inputs:
-    """A batch of pairs along one axis; every tensor is finite."""
+    """A batch of pairs along one axis; maps and weights are finite."""
 
     ref: list[Float[Tensor, "B C h w"]]
     """One map, or the levels of a pyramid; zero where not finite."""
     tgt: list[Float[Tensor, "B C h w"]]
-    ref_finite: list[Bool[Tensor, "B h w"]]
-    tgt_finite: list[Bool[Tensor, "B h w"]]
+    ref_finite: list[Bool[Tensor, "B h w"] | None]
+    """Where they were; None everywhere."""
+    tgt_finite: list[Bool[Tensor, "B h w"] | None]
     weight_ref: list[Float[Tensor, "B h w"]] | None
     """Finite, at least 0, scaled (`_normalised`)."""
     weight_tgt: list[Float[Tensor, "B h w"]] | None
     rho: Float[Tensor, "B H W"]
-    known: Bool[Tensor, "B H W"]
-    """Pixels of the reference whose inverse range may be used."""
+    """As it was given (`ranges`), with `variance` and `mask`."""
     variance: Float[Tensor, "B H W"] | None
+    mask: Bool[Tensor, "B H W"] | None
+    usable: Bool[Tensor, "B"]
+    """Whether a pair has a start and intrinsics that are some."""
     T_tgt_ref: Float64[Tensor, "B 4 4"]
     started: Bool[Tensor, "B"]
     """Whether the start is one."""
@@ -43,6 +47,16 @@ class Inputs:
     batch: torch.Size
     is_pyramid: bool
     """Whether the maps are a pyramid of the caller's."""
+
+    def ranges(self) -> tuple[Float[Tensor, "B H W"], Float[Tensor, "B H W"] | None, Bool[Tensor, "B H W"]]:
+        """Return inverse ranges, their variances, and where they may be used; zero elsewhere."""
+        known, variance = (self.rho >= 0) & (self.rho <= MAX_RHO) & self.usable[:, None, None], None
+        if self.mask is not None:
+            known = known & self.mask
+        if self.variance is not None:
+            sound = (self.variance >= 0) & (self.variance <= MAX_RHO**2)
+            known, variance = known & sound, torch.where(sound, self.variance, 0.0)
+        return torch.where(known, self.rho, 0.0), variance, known
 
 
 def read_inputs(
@@ -82,19 +96,9 @@ def read_inputs(
     B, dtype = math.prod(batch), refs[0].dtype
     flat_ref, ref_finite = _finite_maps(refs, B, dtype)
     flat_tgt, tgt_finite = _finite_maps(tgts, B, dtype)
-    flat_rho = rho.reshape(B, *rho.shape[-2:]).to(dtype)
-    known = (flat_rho >= 0) & (flat_rho <= MAX_RHO)
-    if mask is not None:
-        known = known & mask.reshape(flat_rho.shape)
-    variance = None
-    if rho_variance is not None:
-        variance = rho_variance.reshape(flat_rho.shape).to(dtype)
-        sound = (variance >= 0) & (variance <= MAX_RHO**2)
-        known, variance = known & sound, torch.where(sound, variance, 0.0)
+    size = (B, *rho.shape[-2:])
     T, started = _starts(T_tgt_ref, B, rho.device)
     k, calibrated = _calibrations(intrinsics, camera, B)
-    usable = started if calibrated is None else started & calibrated
-    known = known & usable[:, None, None]
     return Inputs(
         ref=flat_ref,
         tgt=flat_tgt,
@@ -102,9 +106,10 @@ def read_inputs(
         tgt_finite=tgt_finite,
         weight_ref=_weights(refs_weight, B, dtype),
         weight_tgt=_weights(tgts_weight, B, dtype),
-        rho=torch.where(known, flat_rho, 0.0),
-        known=known,
-        variance=variance,
+        rho=rho.reshape(size).to(dtype),
+        variance=None if rho_variance is None else rho_variance.reshape(size).to(dtype),
+        mask=None if mask is None else mask.reshape(size),
+        usable=started if calibrated is None else started & calibrated,
         T_tgt_ref=T,
         started=started,
         intrinsics=k,
@@ -175,12 +180,17 @@ def _check_rest(
             check_shape(name, value, " ".join(str(size) for size in shape))
 
 
-def _finite_maps(maps: list[Tensor], B: int, dtype: torch.dtype) -> tuple[list[Tensor], list[Tensor]]:
+def _finite_maps(maps: list[Tensor], B: int, dtype: torch.dtype) -> tuple[list[Tensor], list[Tensor | None]]:
     """Return the maps with zeros in place of what is not finite, and where all of their channels are."""
-    flat = [value.reshape(B, *value.shape[-3:]).to(dtype) for value in maps]
-    finite = [torch.isfinite(value) for value in flat]
-    clean = [torch.where(good, value, 0.0) for good, value in zip(finite, flat, strict=True)]
-    return clean, [good.all(1) for good in finite]
+    cleaned: list[tuple[Tensor, Tensor | None]] = []
+    for value in maps:
+        flat = value.reshape(B, *value.shape[-3:]).to(dtype)
+        if use_numba(flat) and bool(torch.isfinite(flat.sum())):  # each summand is finite, too
+            cleaned.append((flat, None))
+        else:
+            finite = torch.isfinite(flat)
+            cleaned.append((torch.where(finite, flat, 0.0), finite.all(1)))
+    return [clean for clean, _ in cleaned], [finite for _, finite in cleaned]
 
 
 def _weights(maps: list[Tensor] | None, B: int, dtype: torch.dtype) -> list[Tensor] | None:

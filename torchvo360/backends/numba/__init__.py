@@ -1,6 +1,17 @@
 """The hot kernel as one compiled pass: `linearize` for float32 on the CPU without gradients; needs the extra `fast`."""
 
-from torchvo360.backends.numba.linearize import linearize, serves
+from torchvo360.backends.numba.comparison import brightness_moments, gradient_energy
+from torchvo360.backends.numba.linearize import kernel, linearize, serves
 from torchvo360.backends.numba.solve import Outcomes, Rules, Solved, solve_pairs
 
-__all__ = ["Outcomes", "Rules", "Solved", "linearize", "serves", "solve_pairs"]
+__all__ = [
+    "Outcomes",
+    "Rules",
+    "Solved",
+    "brightness_moments",
+    "gradient_energy",
+    "kernel",
+    "linearize",
+    "serves",
+    "solve_pairs",
+]

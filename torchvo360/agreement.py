@@ -4,9 +4,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from torchvo360.backends import numba, use_numba
-from torchvo360.cameras import Camera
-from torchvo360.residuals.direct import Reference, Samples, Target, look_up
+from torchvo360.backends import Comparison, compare, numba, use_numba
+from torchvo360.residuals.direct import Reference, Target
 
 TOLERANCE_PX = 0.5
 """A residual agrees if a displacement of this many pixels along the gradient would explain it."""
@@ -30,28 +29,27 @@ def agreeing_share(
     Returns:
         Between 0 and 1; 0 where the images have no gradient or no point is seen.
     """
-    dtype = reference.value.dtype
     if use_numba() and numba.serves(reference, target, T_tgt_ref, affine):
-        energy, explained, by_chance = numba.gradient_energy(reference, target, T_tgt_ref, affine, TOLERANCE_PX).unbind(-1)
-        energy = energy.clamp_min(torch.finfo(dtype).tiny)
-        return _beyond_chance(explained / energy, by_chance / energy).to(dtype)
-    return share_beyond_chance(look_up(reference, target, T_tgt_ref.to(dtype), affine.to(dtype)), target.camera)
+        energy, *explained = numba.explained_energy(reference, target, T_tgt_ref, affine, TOLERANCE_PX).unbind(-1)
+        share, chance = (part / energy.clamp_min(torch.finfo(torch.float32).tiny) for part in explained)
+        return _beyond(share, chance).float()
+    return share_beyond_chance(compare(reference, target, T_tgt_ref, affine))
 
 
-def share_beyond_chance(samples: Samples, camera: Camera) -> Float[Tensor, "B"]:
-    """Return `agreeing_share` of samples that have been looked up already."""
-    value = samples.residual + samples.gained
-    total = samples.weight.sum(2, keepdim=True).clamp_min(torch.finfo(samples.weight.dtype).tiny)
-    mean = (value * samples.weight).sum(2, keepdim=True) / total
-    chance = share_of_samples(samples._replace(residual=value - mean), camera)
-    return _beyond_chance(share_of_samples(samples, camera), chance)
+def share_beyond_chance(found: Comparison) -> Float[Tensor, "B"]:
+    """Return `agreeing_share` of what has been compared already."""
+    total = found.weight.sum(2, keepdim=True).clamp_min(torch.finfo(found.weight.dtype).tiny)
+    mean = (found.value * found.weight).sum(2, keepdim=True) / total
+    energy = found.weight * found.slope2
+    chance = _share_of(found.value - mean, energy, found.slope2)
+    return _beyond(_share_of(found.residual, energy, found.slope2), chance)
 
 
-def _beyond_chance(share: Float[Tensor, "B"], chance: Float[Tensor, "B"]) -> Float[Tensor, "B"]:
+def _beyond(share: Float[Tensor, "B"], chance: Float[Tensor, "B"]) -> Float[Tensor, "B"]:
     return ((share - chance) / (1 - chance).clamp_min(1e-3)).clamp_min(0.0)
 
 
-def share_of_samples(samples: Samples, camera: Camera) -> Float[Tensor, "B"]:
+def explained_share(found: Comparison) -> Float[Tensor, "B"]:
     """Return the share of the samples' gradient energy whose residuals are smaller than half a pixel's displacement.
 
     Residuals are measured by the gradient they stand on: neither exposure, nor contrast, nor smooth areas count. True
@@ -60,9 +58,11 @@ def share_of_samples(samples: Samples, camera: Camera) -> Float[Tensor, "B"]:
     Returns:
         Between 0 and 1; 0 where the images have no gradient or no point is seen.
     """
-    Gx, Gy, Gz = samples.G
-    slope2 = (Gx * Gx + Gy * Gy + Gz * Gz) * camera.pixel_angle**2
-    energy = samples.weight * slope2
-    explained = energy * (samples.residual**2 < TOLERANCE_PX**2 * slope2)
-    total = energy.sum((1, 2))
-    return explained.sum((1, 2)) / total.clamp_min(torch.finfo(energy.dtype).tiny)
+    return _share_of(found.residual, found.weight * found.slope2, found.slope2)
+
+
+def _share_of(
+    residual: Float[Tensor, "B C N"], energy: Float[Tensor, "B C N"], slope2: Float[Tensor, "B C N"]
+) -> Float[Tensor, "B"]:
+    explained = energy * (residual.square() < TOLERANCE_PX**2 * slope2)
+    return explained.sum((1, 2)) / energy.sum((1, 2)).clamp_min(torch.finfo(energy.dtype).tiny)

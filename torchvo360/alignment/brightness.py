@@ -6,8 +6,8 @@ import torch
 from jaxtyping import Float, Float64
 from torch import Tensor
 
-from torchvo360.backends import numba, use_numba
-from torchvo360.residuals.direct import Reference, Target, look_up
+from torchvo360.backends import Comparison, compare, numba, use_numba
+from torchvo360.residuals.direct import Reference, Target
 
 
 def match_brightness(reference: Reference, target: Target, T_tgt_ref: Float[Tensor, "B 4 4"]) -> Float[Tensor, "B 2"]:
@@ -25,7 +25,7 @@ def match_brightness(reference: Reference, target: Target, T_tgt_ref: Float[Tens
     if use_numba() and numba.serves(reference, target, T_tgt_ref, T_tgt_ref):
         moments = numba.brightness_moments(reference, target, T_tgt_ref)
     else:
-        moments = _moments(reference, target, T_tgt_ref)
+        moments = _moments(compare(reference, target, T_tgt_ref, T_tgt_ref.new_zeros(len(T_tgt_ref), 2)))
     mean_tgt, variance_tgt, mean_ref, variance_ref = moments.unbind(-1)
     # The floor keeps the root's slope finite where an image has no contrast.
     spread_tgt, spread_ref = (variance_tgt + 1e-16).sqrt(), (variance_ref + 1e-16).sqrt()
@@ -33,16 +33,14 @@ def match_brightness(reference: Reference, target: Target, T_tgt_ref: Float[Tens
     return torch.stack([a, mean_tgt - a.exp() * mean_ref], -1)
 
 
-def _moments(reference: Reference, target: Target, T_tgt_ref: Float[Tensor, "B 4 4"]) -> Float64[Tensor, "B 4"]:
-    """Return mean and variance of what the target shows at the points' places, and of the points."""
-    dtype = reference.value.dtype
-    samples = look_up(reference, target, T_tgt_ref.to(dtype), reference.rho.new_zeros(len(T_tgt_ref), 2))
-    weight = samples.weight.double().mean(1)
+def _moments(found: Comparison) -> Float64[Tensor, "B 4"]:
+    """Return mean and variance of the target, and of the reference, over the means of their channels."""
+    weight = found.weight.double().mean(1)
     # A few heavy pixels say where to align, not how bright the images are.
     weight = torch.minimum(weight, weight.mean(1, keepdim=True))
     total = weight.sum(1).clamp_min(1e-12)
     moments = []
-    for value in (samples.residual + samples.gained, samples.gained):
+    for value in (found.value, found.value - found.residual):
         each = value.double().mean(1)
         mean = (each * weight).sum(1) / total
         moments += [mean, ((each - mean[:, None]).square() * weight).sum(1) / total]

@@ -4,7 +4,7 @@ On a keyframe's few thousand points a step's hundred small tensor operations cos
 """
 
 import torch
-from jaxtyping import Bool, Float, Float64
+from jaxtyping import Bool, Float64
 from torch import Tensor
 
 from torchvo360.alignment.config import AlignConfig

@@ -10,7 +10,8 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.autograd import forward_ad
 
-from torchvo360.backends import eager, numba
+from torchvo360.backends import comparison, eager, numba
+from torchvo360.backends.comparison import Comparison
 from torchvo360.checks import InputError, check_choice
 from torchvo360.residuals.direct import Reference, Target
 from torchvo360.residuals.normal import NormalEquations
@@ -33,6 +34,14 @@ def linearize(
     """Linearise as `backends.eager.linearize` does, on the backend asked for, else the fastest there is for these."""
     compiled = use_numba() and numba.serves(reference, target, T_tgt_ref, affine)
     return (numba if compiled else eager).linearize(reference, target, T_tgt_ref, affine, loss, noise=noise)
+
+
+def compare(
+    reference: Reference, target: Target, T_tgt_ref: Float[Tensor, "B 4 4"], affine: Float[Tensor, "B 2"]
+) -> Comparison:
+    """Compare as `backends.comparison.compare` does, on the backend asked for, else the fastest there is for these."""
+    compiled = use_numba() and numba.serves(reference, target, T_tgt_ref, affine)
+    return (numba if compiled else comparison).compare(reference, target, T_tgt_ref, affine)
 
 
 @contextmanager

@@ -11,8 +11,8 @@ from torchvo360.solve.trace import Trace, last_moves, replay
 __all__ = [
     "COST_ROUNDING",
     "GOING_ON",
-    "LMConfig",
     "PIVOT_TOLERANCE",
+    "LMConfig",
     "Problem",
     "Solution",
     "State",

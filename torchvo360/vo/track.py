@@ -1,18 +1,20 @@
 """Tracking: a frame's pose against a keyframe's points, from a batch of hypotheses, coarse to fine."""
 
-from dataclasses import dataclass, field
+import math
+from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
 import torch
-from jaxtyping import Float64, Int64
+from jaxtyping import Float, Float64, Int64
 from torch import Tensor
 
 from torchvo360 import lie
 from torchvo360.agreement import share_beyond_chance
 from torchvo360.alignment import AlignConfig, PosePrior, solve_level
+from torchvo360.backends import compare
 from torchvo360.checks import InputError, check_finite_number
 from torchvo360.depth import InverseRange
-from torchvo360.residuals.direct import Reference, look_up
+from torchvo360.residuals.direct import Reference, Target
 from torchvo360.residuals.normal import NormalEquations
 from torchvo360.residuals.weights import LossConfig
 from torchvo360.solve import LMConfig, inverse_ldl
@@ -76,17 +78,35 @@ def _thinned(index: Int64[Tensor, "N"], count: int) -> Int64[Tensor, "M"]:
     return index[torch.arange(count, device=index.device) * index.numel() // count]
 
 
-def _reference(key: KeyPoints, level: int, index: Int64[Tensor, "N"], B: int) -> Reference:
-    rho, variance, _ = key.points
-    ray = key.ray[:, index]
+def _references(key: KeyPoints, usable: Int64[Tensor, "N"], counts: list[int]) -> list[Reference]:
+    """Return some of a keyframe's points for each level, the finest first, at most so many; batch 1."""
+    chosen: dict[int, tuple[Tensor, Reference]] = {}
+    references = []
+    for value, most in zip(key.values, counts, strict=True):
+        count = min(most, usable.numel())
+        if count not in chosen:
+            index = _thinned(usable, count)
+            chosen[count] = index, _reference(key, key.values[0], index)
+        index, points = chosen[count]
+        references.append(replace(points, value=value[index][None, None]))
+    return references
+
+
+def _reference(key: KeyPoints, value: Float[Tensor, "N"], index: Int64[Tensor, "M"] | None = None) -> Reference:
+    """Return a keyframe's points, or some of them, as the alignment takes them; batch 1."""
+    ray, rho, variance = key.ray, key.points.rho, key.points.variance
+    if index is not None:
+        ray, rho, variance, value = ray[:, index], rho[index], variance[index], value[index]
     # Points are equal-area already: a further weight by solid angle would count it twice.
-    return Reference(
-        ray=ray[None],
-        rho=rho[index].expand(B, -1),
-        value=key.values[level][index].expand(B, 1, -1),
-        weight=torch.ones_like(rho[index]).expand(B, -1),
-        variance=variance[index].expand(B, -1),
-    )
+    return Reference(ray[None], rho[None], value[None, None], torch.ones_like(rho)[None], variance[None])
+
+
+def _repeated(reference: Reference, target: Target, B: int) -> tuple[Reference, Target]:
+    """Return points and an image for B poses."""
+    if B == 1:
+        return reference, target
+    every = torch.zeros(B, dtype=torch.int64, device=reference.rho.device)
+    return reference.take(every), target.take(every)
 
 
 def track(
@@ -120,28 +140,26 @@ def track(
     device = key.ray.device
     T, ab = T_cam_key.to(device), affine.to(device).expand(T_cam_key.shape[0], 2)
     levels, taken = len(frame.targets), 0
+    counts = [config.points_by_level[min(level, len(config.points_by_level) - 1)] for level in range(levels)]
+    references = _references(key, usable, counts)
     covariance = torch.full((6, 6), torch.inf, dtype=torch.float64)
     for level in range(levels - 1, -1, -1):
-        count = config.points_by_level[min(level, len(config.points_by_level) - 1)]
         steps = config.steps_by_level[min(level, len(config.steps_by_level) - 1)]
         B = T.shape[0]
-        reference = _reference(key, level, _thinned(usable, count), B)
-        target = frame.targets[level]
-        if B > 1:
-            target = target.take(torch.zeros(B, dtype=torch.int64, device=T.device))
+        reference, target = _repeated(references[level], frame.targets[level], B)
         known = None if prior is None else PosePrior(*(part.to(device).expand(B, -1, -1) for part in prior))
         align_config = config.align_config(level == levels - 1)
         solution = solve_level(reference, target, T, ab, align_config, max_steps=steps, prior=known)
         cost = solution.equations.cost / solution.equations.weight
-        best = int(cost.nan_to_num(nan=torch.inf).argmin())
-        if not bool(torch.isfinite(cost[best])):
+        best = int(cost.nan_to_num(nan=torch.inf).argmin()) if B > 1 else 0
+        if not math.isfinite(float(cost[best])):
             return None
         T, ab = solution.state[0][best : best + 1], solution.state[1][best : best + 1]
         taken += int(solution.steps[best])
         if level == 0:
             covariance = _covariance(solution.equations, best)
     T_best, ab_best = lie.se3_normalized(T[0]).to(T_cam_key.device), ab[0].to(affine.device)
-    found = measure(key, frame, T_best, ab_best, _thinned(usable, config.points_by_level[0]))
+    found = _measured(references[0], frame, T_best, ab_best)
     return found._replace(covariance=covariance.to(T_cam_key.device), steps=taken)
 
 
@@ -156,7 +174,8 @@ def measure_keyframe(key: Keyframe, config: TrackConfig, max_relative_variance: 
     """Return a keyframe as it tracks itself."""
     index = key.trusted(max_relative_variance).nonzero()[:, 0]
     eye, none = torch.eye(4, dtype=torch.float64), torch.zeros(2, dtype=torch.float64)
-    return measure(key, key.frame, eye, none, _thinned(index, config.points_by_level[0]))
+    reference = _reference(key, key.values[0], _thinned(index, config.points_by_level[0]))
+    return _measured(reference, key.frame, eye, none)
 
 
 def judge_points(key: KeyPoints, frame: PyramidFrame, found: Track, max_difference: float) -> None:
@@ -169,28 +188,22 @@ def judge_points(key: KeyPoints, frame: PyramidFrame, found: Track, max_differen
         max_difference: Intensities that differ by more than this, and by three median differences, do not fit.
     """
     rho, variance, score = key.points
-    reference = _reference(key, 0, torch.arange(len(rho), device=rho.device), 1)
-    T, ab = found.T_cam_key[None].to(rho), found.affine[None].to(rho)
-    samples = look_up(reference, frame.targets[0], T, ab)
-    off, seen = samples.residual[0, 0].abs(), samples.weight[0, 0] > 0
+    T, ab = found.T_cam_key[None].to(rho.device), found.affine[None].to(rho.device)
+    met = compare(_reference(key, key.values[0]), frame.targets[0], T, ab)
+    off, seen = met.residual[0, 0].abs(), met.weight[0, 0] > 0
     used = seen & (score > 0)
     usual = float(off[used].median()) if bool(used.any()) else 0.0
     change = torch.where(off > max(max_difference, 3 * usual), -1.0, 0.5)
     key.points = InverseRange(rho, variance, (score + change * seen).clamp(WORST, BEST))
 
 
-def measure(
-    key: KeyPoints,
-    frame: PyramidFrame,
-    T_cam_key: Float64[Tensor, "4 4"],
-    affine: Float64[Tensor, "2"],
-    index: Int64[Tensor, "N"],
+def _measured(
+    reference: Reference, frame: PyramidFrame, T_cam_key: Float64[Tensor, "4 4"], affine: Float64[Tensor, "2"]
 ) -> Track:
     """Return a pose with its mean absolute residual and its agreement on the finest level."""
-    reference = _reference(key, 0, index, 1)
-    samples = look_up(reference, frame.targets[0], T_cam_key[None].to(reference.rho), affine[None].to(reference.rho))
-    weight = samples.weight.sum().clamp_min(1e-9)
-    residual = float((samples.residual.abs() * samples.weight).sum() / weight)
+    device = reference.rho.device
+    met = compare(reference, frame.targets[0], T_cam_key[None].to(device), affine[None].to(device))
+    residual = float((met.residual.abs() * met.weight).sum() / met.weight.sum().clamp_min(1e-9))
     # Beyond chance: in an unrelated image of strong contrast a gain of zero explains most of the gradient.
-    inliers = float(share_beyond_chance(samples, frame.targets[0].camera)[0])
+    inliers = float(share_beyond_chance(met)[0])
     return Track(T_cam_key, affine, residual, inliers, torch.full((6, 6), torch.inf, dtype=torch.float64))

@@ -1,6 +1,6 @@
 """The hot kernel as one compiled pass: `linearize` for float32 on the CPU without gradients; needs the extra `fast`."""
 
-from torchvo360.backends.numba.comparison import brightness_moments, gradient_energy
+from torchvo360.backends.numba.comparison import brightness_moments, compare, explained_energy
 from torchvo360.backends.numba.linearize import kernel, linearize, serves
 from torchvo360.backends.numba.solve import Outcomes, Rules, Solved, solve_pairs
 
@@ -9,7 +9,8 @@ __all__ = [
     "Rules",
     "Solved",
     "brightness_moments",
-    "gradient_energy",
+    "compare",
+    "explained_energy",
     "kernel",
     "linearize",
     "serves",

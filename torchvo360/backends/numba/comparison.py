@@ -1,18 +1,30 @@
-"""Two images compared at given poses in one compiled pass: their agreement, and their brightness."""
+"""`compare` on the compiled pass, and sums over what it would give."""
 
-import math
+from typing import Any
 
 import numpy as np
 import torch
 from jaxtyping import Float, Float64
 from torch import Tensor
 
+from torchvo360.backends.comparison import Comparison
 from torchvo360.backends.numba.linearize import as_arrays, kernel
 from torchvo360.residuals.direct import Reference, Target
 from torchvo360.residuals.weights import LossConfig
 
+ANY_LOSS = LossConfig()
 
-def gradient_energy(
+
+def compare(
+    reference: Reference, target: Target, T_tgt_ref: Float[Tensor, "B 4 4"], affine: Float[Tensor, "B 2"]
+) -> Comparison:
+    """Compare as `backends.comparison.compare` does, in one pass; the arguments must be what `serves` says."""
+    out = np.empty((len(T_tgt_ref), 4, *reference.value.shape[1:]), np.float32)
+    kernel("samples").sample_pairs(*_arrays(reference, target, T_tgt_ref, affine), out)
+    return Comparison(*torch.from_numpy(out).unbind(1))
+
+
+def explained_energy(
     reference: Reference,
     target: Target,
     T_tgt_ref: Float[Tensor, "B 4 4"],
@@ -22,15 +34,15 @@ def gradient_energy(
     """Return each pair's gradient energy, what of it the reference explains, and what its channels' means would.
 
     Args:
-        reference: Points, with `target`, `T_tgt_ref` and `affine` as `linearize` takes them.
+        reference: Points, with `target`, `T_tgt_ref` and `affine` as `compare` takes them.
         target: Images.
         T_tgt_ref: Poses.
-        affine: (a, b).
+        affine: (a, b) of each pair.
         tolerance_px: The displacement along the gradient that explains a residual.
     """
     sums = np.zeros((len(T_tgt_ref), 3))
-    tolerance = np.float32(tolerance_px * target.camera.pixel_angle)
-    kernel("agreement").sum_agreement(*_arrays(reference, target, T_tgt_ref, affine), tolerance**2, sums)
+    arrays = _arrays(reference, target, T_tgt_ref, affine)
+    kernel("summaries").explain_pairs(*arrays, np.float32(tolerance_px**2), sums)
     return torch.from_numpy(sums)
 
 
@@ -40,16 +52,17 @@ def brightness_moments(
     """Return mean and variance of each target where its reference's points come to lie, and those of the points.
 
     Args:
-        reference: Points, with `target` and `T_tgt_ref` as `linearize` takes them.
+        reference: Points, with `target` and `T_tgt_ref` as `compare` takes them.
         target: Images.
         T_tgt_ref: Poses.
     """
     moments = np.zeros((len(T_tgt_ref), 4))
-    affine = T_tgt_ref.new_zeros(len(T_tgt_ref), 2)
-    kernel("agreement").measure_brightness(*_arrays(reference, target, T_tgt_ref, affine), moments)
+    arrays = _arrays(reference, target, T_tgt_ref, T_tgt_ref.new_zeros(len(T_tgt_ref), 2))
+    kernel("summaries").measure_pairs(*arrays, moments)
     return torch.from_numpy(moments)
 
 
-def _arrays(reference: Reference, target: Target, T_tgt_ref: Tensor, affine: Tensor) -> tuple:
-    saturation = math.inf if target.saturation is None else target.saturation
-    return *as_arrays(reference, target, T_tgt_ref, affine, LossConfig(), 1.0)[:6], np.float32(saturation)
+def _arrays(reference: Reference, target: Target, T_tgt_ref: Tensor, affine: Tensor) -> tuple[Any, ...]:
+    """Return what the kernels take but for their last arguments."""
+    *arguments, loss = as_arrays(reference, target, T_tgt_ref, affine, ANY_LOSS, 1.0)
+    return *arguments, loss[-2], np.float32(target.camera.pixel_angle**2)

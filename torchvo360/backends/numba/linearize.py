@@ -1,5 +1,6 @@
 """`linearize` on the compiled pass: tensors to arrays, and sums to normal equations."""
 
+import functools
 import importlib
 import math
 from typing import Any
@@ -118,13 +119,18 @@ def _optics(target: Target) -> tuple[int, bool, bool, np.float32]:
 
 
 def _loss(loss: LossConfig, saturation: float | None, noise: float) -> tuple[int | np.float32, ...]:
-    cutoff, most = math.inf, math.inf
-    if loss.cutoff is not None:
-        cutoff = loss.cutoff
-        most = float(robust(torch.tensor(cutoff), loss)[1])
-    clipped = math.inf if saturation is None else saturation
-    numbers = (loss.scale, loss.degrees_of_freedom, cutoff, most, clipped, noise)
-    return (LOSSES.index(loss.name), *(np.float32(number) for number in numbers))
+    kind, *numbers = _robust(loss.name, loss.scale, loss.degrees_of_freedom, loss.cutoff)
+    return (kind, *numbers, np.float32(math.inf if saturation is None else saturation), np.float32(noise))
+
+
+@functools.lru_cache
+def _robust(name: str, scale: float, freedom: float, cutoff: float | None) -> tuple[int | np.float32, ...]:
+    """Return a loss by its number, scale, degrees of freedom, cut-off and the cost there."""
+    end, most = math.inf, math.inf
+    if cutoff is not None:
+        loss = LossConfig(name=name, scale=scale, degrees_of_freedom=freedom, cutoff=cutoff)
+        end, most = cutoff, float(robust(torch.tensor(cutoff), loss)[1])
+    return (LOSSES.index(name), *(np.float32(number) for number in (scale, freedom, end, most)))
 
 
 def _check_shapes(reference: Reference, target: Target, T_tgt_ref: Tensor, affine: Tensor) -> None:

@@ -33,40 +33,47 @@ def element(array, b):
 
 
 @compiled()
+def place_block(s, index, at, end, ray, rho, weight, images, b, T, k, optics):
+    """Warp the points from at to end, find their cells, and weigh them by what the image is sure of there."""
+    padded, confidence = images
+    kind, wraps, wrap_again, _ = optics
+    fx, fy, cx, cy = k[0], k[1], k[2], k[3]
+    height, width = padded.shape[2] - 2, padded.shape[3] - 2
+    n = end - at
+    warp(s, n, ray[0, at:end], ray[1, at:end], ray[2, at:end], rho[at:end], weight[at:end], T)
+    if kind == SPHERE:
+        project_sphere(s, n, fx, fy, cx, cy)
+        if wrap_again:
+            wrap(s, n, f4(width) if wraps else abs(fx) * (TWO * PI))
+    else:
+        project_pinhole(s, n, fx, fy, cx, cy)
+    if not wraps:
+        hide_unseen(s, n, f4(width - 0.5), f4(height - 0.5), NEAREST if kind == PINHOLE else f4(-np.inf))
+    locate(s, index, n, height, width)
+    if confidence.size:
+        gather(s, index, n, element(confidence, b)[0].reshape(-1), width + 2)
+        doubt(s, n)
+
+
+@compiled()
 def sum_part(s, index, b, first, last, points, images, T, affine, k, optics, loss, sums):
     """Sum the points from first to last of pair b."""
     ray, rho, value, weight, variance = points
-    padded, confidence = images
-    kind, wraps, wrap_again, polar2 = optics
+    padded, _ = images
+    kind, _, _, polar2 = optics
     loss_kind, scale, freedom, cutoff, most, saturation, noise = loss
     ray, rho, value, weight = element(ray, b), element(rho, b), element(value, b), element(weight, b)
     image, T, k = element(padded, b), T[b], element(k, b)
-    fx, fy, cx, cy = k[0], k[1], k[2], k[3]
-    C, height, width = image.shape[0], image.shape[1] - 2, image.shape[2] - 2
-    pitch = width + 2
+    C, pitch = image.shape[0], image.shape[2]
     gain, offset = f4(math.exp(f4(affine[b, 0]))), f4(affine[b, 1])
-    period = f4(width) if wraps else abs(fx) * (TWO * PI)
-    nearest = NEAREST if kind == PINHOLE else f4(-np.inf)
     M, total_cost, total_weight = np.zeros((9, 9)), 0.0, 0.0
     for at in range(first, last, BLOCK):
         end = min(at + BLOCK, last)
         n = end - at
-        warp(s, n, ray[0, at:end], ray[1, at:end], ray[2, at:end], rho[at:end], weight[at:end], T)
-        if kind == SPHERE:
-            project_sphere(s, n, fx, fy, cx, cy)
-            if wrap_again:
-                wrap(s, n, period)
-        else:
-            project_pinhole(s, n, fx, fy, cx, cy)
-        if not wraps:
-            hide_unseen(s, n, f4(width - 0.5), f4(height - 0.5), nearest)
-        locate(s, index, n, height, width)
-        if confidence.size:
-            gather(s, index, n, element(confidence, b)[0].reshape(-1), pitch)
-            doubt(s, n)
+        place_block(s, index, at, end, ray, rho, weight, images, b, T, k, optics)
         for c in range(C):
             gather(s, index, n, image[c].reshape(-1), pitch)
-            compare(s, n, kind, value[c, at:end], gain, offset, saturation, fx, fy, polar2)
+            compare(s, n, kind, value[c, at:end], gain, offset, saturation, k[0], k[1], polar2)
             if variance.size:
                 shrink(s, n, element(variance, b)[at:end], T, noise)
             weigh(s, n, loss_kind, scale, freedom, cutoff, most, variance.size > 0)

@@ -1,6 +1,7 @@
-"""Levels, brightness and agreement by compiled passes are those of torch: sizes, edges, masks and all that is optional."""
+"""Levels, brightness and agreement by compiled passes are those of torch, whatever sizes, edges, masks and weights."""
 
 import math
+from typing import Any
 
 import pytest
 import torch
@@ -27,7 +28,7 @@ CAMERAS: list[Camera] = [
 every_camera = pytest.mark.parametrize("camera", CAMERAS, ids=["even", "odd", "partial", "pinhole", "odd pinhole"])
 
 
-def given(camera: Camera, C: int, *, everything: bool) -> dict[str, Tensor | None]:
+def given(camera: Camera, C: int, *, everything: bool) -> dict[str, Any]:
     """Two pairs with holes in their ranges; or with holes in all, and all that may be given."""
     generator = torch.Generator().manual_seed(4)
     H, W = camera.height, camera.width
@@ -38,7 +39,7 @@ def given(camera: Camera, C: int, *, everything: bool) -> dict[str, Tensor | Non
     ref, tgt, rho = rand(2, C, H, W), rand(2, C, H, W), rand(2, H, W)
     rho[:, :3, 5:] = math.nan
     rho[0, 9, ::3] = -1.0
-    values: dict[str, Tensor | None] = dict.fromkeys(("T", "mask", "weight_ref", "weight_tgt", "variance", "k"))
+    values: dict[str, Any] = dict.fromkeys(("T", "mask", "weight_ref", "weight_tgt", "variance", "k"))
     values |= {"ref": ref, "tgt": tgt, "rho": rho}
     if everything:
         ref[0, 0, 4, 7], tgt[1, -1, -1, 3] = math.nan, math.inf
@@ -50,7 +51,7 @@ def given(camera: Camera, C: int, *, everything: bool) -> dict[str, Tensor | Non
     return values
 
 
-def levels_of(camera: Camera, values: dict[str, Tensor | None], config: AlignConfig, name: str) -> list[Level]:
+def levels_of(camera: Camera, values: dict[str, Any], config: AlignConfig, name: str) -> list[Level]:
     with backend(name):
         order = ("T", "mask", "weight_ref", "weight_tgt", "variance", "k")
         inputs = read_inputs(values["ref"], values["tgt"], values["rho"], camera, *(values[name] for name in order))

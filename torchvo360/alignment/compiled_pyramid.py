@@ -42,11 +42,12 @@ class Stack:
 
     def __init__(self, planes: int, sizes: np.ndarray) -> None:
         """Take the memory for so many planes at each level's size."""
-        counts = [planes * h * w for h, w in sizes.tolist()]
+        shapes = [(planes, h, w) for h, w in sizes.tolist()]
+        counts = [math.prod(shape) for shape in shapes]
         whole = torch.empty(sum(counts))
         self.planes = planes
         self.flat = whole.numpy()
-        self.levels = [part.view(planes, h, w) for part, (h, w) in zip(whole.split(counts), sizes.tolist(), strict=True)]
+        self.levels = [part.view(shape) for part, shape in zip(whole.split(counts), shapes, strict=True)]
         """[planes, h, w] each."""
 
 
@@ -93,7 +94,9 @@ def build_levels(inputs: Inputs, camera: Camera, config: AlignConfig) -> list[Le
         image, (*values, weights) = images.levels[number], ranges.levels[number].view(-1, B, at.height * at.width)
         if weight is not None:
             weights = weights * image[-B:].view(B, -1)
-        ray, k = (grids.rays[number], None) if inputs.intrinsics is None else own_rays(inputs.intrinsics, at, camera, torch.float32)
+        ray, k = grids.rays[number], None
+        if inputs.intrinsics is not None:
+            ray, k = own_rays(inputs.intrinsics, at, camera, torch.float32)
         reference = Reference(ray, values[0], image[: B * C].view(B, C, -1), weights, *values[1:])
         confidences = None if doubts is None else doubts.levels[number][:, None]
         target = targets.levels[number].view(B, C, at.height + 2, at.width + 2)
@@ -109,7 +112,7 @@ def _ranges(inputs: Inputs, camera: Camera, config: AlignConfig, grids: Grids, s
         sound = eroded(inputs.ref_finite[0], camera, config.blur_px, branches=True)
         allowed = sound if allowed is None else allowed & sound
     out = Stack((kinds + 1) * B, grids.sizes)
-    kernel("planes").open_ranges(
+    kernel("ranges").open_ranges(
         _flat(inputs.rho),
         NO_VALUES if inputs.variance is None else _flat(inputs.variance),
         NO_MASK if allowed is None else _flat(allowed),
@@ -119,7 +122,7 @@ def _ranges(inputs: Inputs, camera: Camera, config: AlignConfig, grids: Grids, s
         out.flat,
     )
     kernel("planes").shrink_levels(out.flat, out.planes, grids.sizes)
-    kernel("planes").close_ranges(out.flat, kinds, B, grids.sizes, grids.areas)
+    kernel("ranges").close_ranges(out.flat, kinds, B, grids.sizes, grids.areas)
     return out
 
 

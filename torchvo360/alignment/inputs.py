@@ -220,20 +220,26 @@ def _starts(T_tgt_ref: Tensor | None, B: int, device: torch.device) -> tuple[Ten
     if T_tgt_ref is None:
         return eye, torch.ones(B, dtype=torch.bool, device=device)
     T = T_tgt_ref.reshape(B, 4, 4).double()
-    exact = torch.from_numpy(_are_exact(T.detach().numpy())) if use_numba(T) else None
-    if exact is not None and bool(exact.all()):
+    plain = use_numba() and T.device.type == "cpu"
+    exact = torch.from_numpy(_are_exact(T.detach().numpy())) if plain else None
+    if exact is not None and bool(exact.all()) and not T.requires_grad:
         return T, exact
     started = is_pose(T) & (T[:, :3, 3].abs() < MAX_TRANSLATION).all(-1)
     normal = lie.se3_normalized(torch.where(started[:, None, None], T, eye))
-    return normal if exact is None else torch.where(exact[:, None, None], T, normal), started
+    if exact is None:
+        return normal, started
+    # The value is the same whether a gradient is asked or not, which is that of the normalised start.
+    return normal + torch.where(exact[:, None, None], T - normal, 0.0).detach(), started
 
 
 def _are_exact(T: Float64[np.ndarray, "B 4 4"]) -> Bool[np.ndarray, "B"]:
     """Return which starts need not be normalised: forty small operations of torch cost half a millisecond."""
     R, last = T[:, :3, :3], np.array([0.0, 0.0, 0.0, 1.0])
-    apart = np.abs(R @ R.transpose(0, 2, 1) - np.eye(3)).max((1, 2), initial=0.0)
+    with np.errstate(invalid="ignore", over="ignore"):
+        apart = np.abs(R @ R.transpose(0, 2, 1) - np.eye(3)).max((1, 2), initial=0.0)
+        turned = np.linalg.det(R) > 0
     near = (np.abs(T[:, :3, 3]) < MAX_TRANSLATION).all(1)
-    return (apart < EXACT) & near & (T[:, 3] == last).all(1) & (np.linalg.det(R) > 0)
+    return (apart < EXACT) & near & (T[:, 3] == last).all(1) & turned
 
 
 def _calibrations(intrinsics: Tensor | None, camera: Camera, B: int) -> tuple[Tensor | None, Tensor | None]:

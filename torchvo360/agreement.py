@@ -4,7 +4,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from torchvo360.backends import Comparison, compare
+from torchvo360.backends import Comparison, compare, numba, use_numba
 from torchvo360.residuals.direct import Reference, Target
 
 TOLERANCE_PX = 0.5
@@ -29,6 +29,10 @@ def agreeing_share(
     Returns:
         Between 0 and 1; 0 where the images have no gradient or no point is seen.
     """
+    if use_numba() and numba.serves(reference, target, T_tgt_ref, affine):
+        energy, *explained = numba.explained_energy(reference, target, T_tgt_ref, affine, TOLERANCE_PX).unbind(-1)
+        share, chance = (part / energy.clamp_min(torch.finfo(torch.float32).tiny) for part in explained)
+        return _beyond(share, chance).float()
     return share_beyond_chance(compare(reference, target, T_tgt_ref, affine))
 
 
@@ -38,7 +42,10 @@ def share_beyond_chance(found: Comparison) -> Float[Tensor, "B"]:
     mean = (found.value * found.weight).sum(2, keepdim=True) / total
     energy = found.weight * found.slope2
     chance = _share_of(found.value - mean, energy, found.slope2)
-    share = _share_of(found.residual, energy, found.slope2)
+    return _beyond(_share_of(found.residual, energy, found.slope2), chance)
+
+
+def _beyond(share: Float[Tensor, "B"], chance: Float[Tensor, "B"]) -> Float[Tensor, "B"]:
     return ((share - chance) / (1 - chance).clamp_min(1e-3)).clamp_min(0.0)
 
 

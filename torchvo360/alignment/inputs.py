@@ -1,20 +1,25 @@
-"""What `align` is given: checked, flattened to one batch axis, and rid of numbers that cannot be used."""
+"""What `align` is given: checked, flattened to one batch axis, and what of it can be used."""
 
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+import numpy as np
 import torch
 from jaxtyping import Bool, Float, Float64
 from torch import Tensor
 
 from torchvo360 import lie
 from torchvo360.alignment.level import MAX_TRANSLATION
+from torchvo360.backends import use_numba
 from torchvo360.cameras import Camera
 from torchvo360.checks import InputError, check_same_device, check_shape, is_pose
 
 MAX_RHO = 1e9
 """Inverse ranges above this, 1/m, are no range of anything; their squares would overflow in float32."""
+
+EXACT = 1e-12
+"""Rotations whose rows are orthonormal to within this stay as they are."""
 
 Maps = Tensor | Sequence[Tensor]
 """Maps of the camera's size, or a pyramid of one's own, the finest first."""
@@ -22,20 +27,23 @@ Maps = Tensor | Sequence[Tensor]
 
 @dataclass(frozen=True)
 class Inputs:
-    """A batch of pairs along one axis; every tensor is finite."""
+    """A batch of pairs along one axis; maps and weights are finite."""
 
     ref: list[Float[Tensor, "B C h w"]]
     """One map, or the levels of a pyramid; zero where not finite."""
     tgt: list[Float[Tensor, "B C h w"]]
-    ref_finite: list[Bool[Tensor, "B h w"]]
-    tgt_finite: list[Bool[Tensor, "B h w"]]
+    ref_finite: list[Bool[Tensor, "B h w"] | None]
+    """Where they were; None everywhere."""
+    tgt_finite: list[Bool[Tensor, "B h w"] | None]
     weight_ref: list[Float[Tensor, "B h w"]] | None
     """Finite, at least 0, scaled (`_normalised`)."""
     weight_tgt: list[Float[Tensor, "B h w"]] | None
     rho: Float[Tensor, "B H W"]
-    known: Bool[Tensor, "B H W"]
-    """Pixels of the reference whose inverse range may be used."""
+    """As it was given (`ranges`), with `variance` and `mask`."""
     variance: Float[Tensor, "B H W"] | None
+    mask: Bool[Tensor, "B H W"] | None
+    usable: Bool[Tensor, "B"]
+    """Whether a pair has a start and intrinsics that are some."""
     T_tgt_ref: Float64[Tensor, "B 4 4"]
     started: Bool[Tensor, "B"]
     """Whether the start is one."""
@@ -43,6 +51,16 @@ class Inputs:
     batch: torch.Size
     is_pyramid: bool
     """Whether the maps are a pyramid of the caller's."""
+
+    def ranges(self) -> tuple[Float[Tensor, "B H W"], Float[Tensor, "B H W"] | None, Bool[Tensor, "B H W"]]:
+        """Return inverse ranges, their variances, and where they may be used; zero elsewhere."""
+        known, variance = (self.rho >= 0) & (self.rho <= MAX_RHO) & self.usable[:, None, None], None
+        if self.mask is not None:
+            known = known & self.mask
+        if self.variance is not None:
+            sound = (self.variance >= 0) & (self.variance <= MAX_RHO**2)
+            known, variance = known & sound, torch.where(sound, self.variance, 0.0)
+        return torch.where(known, self.rho, 0.0), variance, known
 
 
 def read_inputs(
@@ -82,19 +100,9 @@ def read_inputs(
     B, dtype = math.prod(batch), refs[0].dtype
     flat_ref, ref_finite = _finite_maps(refs, B, dtype)
     flat_tgt, tgt_finite = _finite_maps(tgts, B, dtype)
-    flat_rho = rho.reshape(B, *rho.shape[-2:]).to(dtype)
-    known = (flat_rho >= 0) & (flat_rho <= MAX_RHO)
-    if mask is not None:
-        known = known & mask.reshape(flat_rho.shape)
-    variance = None
-    if rho_variance is not None:
-        variance = rho_variance.reshape(flat_rho.shape).to(dtype)
-        sound = (variance >= 0) & (variance <= MAX_RHO**2)
-        known, variance = known & sound, torch.where(sound, variance, 0.0)
+    size = (B, *rho.shape[-2:])
     T, started = _starts(T_tgt_ref, B, rho.device)
     k, calibrated = _calibrations(intrinsics, camera, B)
-    usable = started if calibrated is None else started & calibrated
-    known = known & usable[:, None, None]
     return Inputs(
         ref=flat_ref,
         tgt=flat_tgt,
@@ -102,9 +110,10 @@ def read_inputs(
         tgt_finite=tgt_finite,
         weight_ref=_weights(refs_weight, B, dtype),
         weight_tgt=_weights(tgts_weight, B, dtype),
-        rho=torch.where(known, flat_rho, 0.0),
-        known=known,
-        variance=variance,
+        rho=rho.reshape(size).to(dtype),
+        variance=None if rho_variance is None else rho_variance.reshape(size).to(dtype),
+        mask=None if mask is None else mask.reshape(size),
+        usable=started if calibrated is None else started & calibrated,
         T_tgt_ref=T,
         started=started,
         intrinsics=k,
@@ -175,12 +184,17 @@ def _check_rest(
             check_shape(name, value, " ".join(str(size) for size in shape))
 
 
-def _finite_maps(maps: list[Tensor], B: int, dtype: torch.dtype) -> tuple[list[Tensor], list[Tensor]]:
+def _finite_maps(maps: list[Tensor], B: int, dtype: torch.dtype) -> tuple[list[Tensor], list[Tensor | None]]:
     """Return the maps with zeros in place of what is not finite, and where all of their channels are."""
-    flat = [value.reshape(B, *value.shape[-3:]).to(dtype) for value in maps]
-    finite = [torch.isfinite(value) for value in flat]
-    clean = [torch.where(good, value, 0.0) for good, value in zip(finite, flat, strict=True)]
-    return clean, [good.all(1) for good in finite]
+    cleaned: list[tuple[Tensor, Tensor | None]] = []
+    for value in maps:
+        flat = value.reshape(B, *value.shape[-3:]).to(dtype)
+        if use_numba(flat) and bool(torch.isfinite(flat.sum())):  # each summand is finite, too
+            cleaned.append((flat, None))
+        else:
+            finite = torch.isfinite(flat)
+            cleaned.append((torch.where(finite, flat, 0.0), finite.all(1)))
+    return [clean for clean, _ in cleaned], [finite for _, finite in cleaned]
 
 
 def _weights(maps: list[Tensor] | None, B: int, dtype: torch.dtype) -> list[Tensor] | None:
@@ -206,8 +220,26 @@ def _starts(T_tgt_ref: Tensor | None, B: int, device: torch.device) -> tuple[Ten
     if T_tgt_ref is None:
         return eye, torch.ones(B, dtype=torch.bool, device=device)
     T = T_tgt_ref.reshape(B, 4, 4).double()
+    plain = use_numba() and T.device.type == "cpu"
+    exact = torch.from_numpy(_are_exact(T.detach().numpy())) if plain else None
+    if exact is not None and bool(exact.all()) and not T.requires_grad:
+        return T, exact
     started = is_pose(T) & (T[:, :3, 3].abs() < MAX_TRANSLATION).all(-1)
-    return lie.se3_normalized(torch.where(started[:, None, None], T, eye)), started
+    normal = lie.se3_normalized(torch.where(started[:, None, None], T, eye))
+    if exact is None:
+        return normal, started
+    # The value is the same whether a gradient is asked or not, which is that of the normalised start.
+    return normal + torch.where(exact[:, None, None], T - normal, 0.0).detach(), started
+
+
+def _are_exact(T: Float64[np.ndarray, "B 4 4"]) -> Bool[np.ndarray, "B"]:
+    """Return which starts need not be normalised: forty small operations of torch cost half a millisecond."""
+    R, last = T[:, :3, :3], np.array([0.0, 0.0, 0.0, 1.0])
+    with np.errstate(invalid="ignore", over="ignore"):
+        apart = np.abs(R @ R.transpose(0, 2, 1) - np.eye(3)).max((1, 2), initial=0.0)
+        turned = np.linalg.det(R) > 0
+    near = (np.abs(T[:, :3, 3]) < MAX_TRANSLATION).all(1)
+    return (apart < EXACT) & near & (T[:, 3] == last).all(1) & turned
 
 
 def _calibrations(intrinsics: Tensor | None, camera: Camera, B: int) -> tuple[Tensor | None, Tensor | None]:

@@ -14,11 +14,13 @@ from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
 from torchvo360.agreement import agreeing_share
+from torchvo360.alignment import compiled_pyramid, pyramid
 from torchvo360.alignment.backward import attach_solution, attach_steps, has_gradient
+from torchvo360.alignment.brightness import match_brightness
 from torchvo360.alignment.config import BACKWARD, AlignConfig
 from torchvo360.alignment.inputs import Inputs, Maps, read_inputs
-from torchvo360.alignment.level import free_parameters, match_brightness, solve_level
-from torchvo360.alignment.pyramid import Level, build_levels
+from torchvo360.alignment.level import free_parameters, solve_level
+from torchvo360.alignment.pyramid import Level
 from torchvo360.alignment.result import AlignMaps, AlignResult, LevelHistory
 from torchvo360.backends import linearize
 from torchvo360.cameras import Camera
@@ -88,7 +90,8 @@ def align(
     device = inputs.rho.device.type
     followed = torch.is_grad_enabled() and config.backward != "none"
     with torch.set_grad_enabled(followed), torch.autocast(device, enabled=False):
-        levels = build_levels(inputs, camera, config)
+        compiled = compiled_pyramid.serves(inputs, camera, config)
+        levels = (compiled_pyramid if compiled else pyramid).build_levels(inputs, camera, config)
         return _coarse_to_fine(levels, inputs, config, outputs)
 
 

@@ -1,8 +1,7 @@
-"""Alignment at one resolution: where to start the brightness, and the solve: compiled where it serves (`compiled`)."""
+"""Alignment at one resolution: compiled where it serves (`compiled`), else in steps of torch."""
 
 from __future__ import annotations
 
-import math
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -14,7 +13,7 @@ from torch import Tensor
 from torchvo360 import lie
 from torchvo360.alignment import compiled
 from torchvo360.alignment.config import AlignConfig
-from torchvo360.backends import compare, linearize
+from torchvo360.backends import linearize
 from torchvo360.residuals.direct import Reference, Target
 from torchvo360.residuals.normal import NormalEquations
 from torchvo360.solve import Problem, Solution, minimize
@@ -24,37 +23,6 @@ MAX_TRANSLATION = 1e6
 
 MAX_LOG_GAIN = 10.0
 """Exposures differ by less than e to this power, fourteen stops."""
-
-
-def match_brightness(reference: Reference, target: Target, T_tgt_ref: Float[Tensor, "B 4 4"]) -> Float[Tensor, "B 2"]:
-    """Return (a, b) that give the reference's points the mean and spread of what the target shows at their places.
-
-    The places are those of the start. It need not be close: where the same things are in view, moments are much the
-    same, and exposure jumps of several stops are bridged before the first step. The gain is held within a factor of
-    five; where nothing is seen the brightness is taken as equal.
-
-    Args:
-        reference: Points.
-        target: Images.
-        T_tgt_ref: Starts.
-    """
-    met = compare(reference, target, T_tgt_ref, T_tgt_ref.new_zeros(len(T_tgt_ref), 2))
-    weight = met.weight.double().mean(1)
-    # A few heavy pixels say where to align, not how bright the images are.
-    weight = torch.minimum(weight, weight.mean(1, keepdim=True))
-    total = weight.sum(1).clamp_min(1e-12)
-
-    def moments(value: Tensor) -> tuple[Tensor, Tensor]:
-        each = value.double().mean(1)
-        mean = (each * weight).sum(1) / total
-        variance = ((each - mean[:, None]).square() * weight).sum(1) / total
-        # The floor keeps the root's slope finite where an image has no contrast.
-        return mean, (variance + 1e-16).sqrt()
-
-    mean_tgt, spread_tgt = moments(met.value)
-    mean_ref, spread_ref = moments(reference.value)
-    a = ((spread_tgt + 1e-4) / (spread_ref + 1e-4)).log().clamp(-math.log(5), math.log(5))
-    return torch.stack([a, mean_tgt - a.exp() * mean_ref], -1)
 
 
 def retract(state: tuple[Tensor, ...], delta: Float[Tensor, "B 8"]) -> tuple[Tensor, ...]:
@@ -71,10 +39,7 @@ def is_sensible(state: tuple[Tensor, ...]) -> Bool[Tensor, "B"]:
 
 def free_parameters(config: AlignConfig, device: torch.device, *, motion_only: bool = False) -> Bool[Tensor, "8"]:
     """Return which of (v, w, a, b) are estimated."""
-    free = torch.ones(8, dtype=torch.bool, device=device)
-    if motion_only or not config.affine:
-        free[6:] = False
-    return free
+    return torch.arange(8, device=device) < (8 if config.affine and not motion_only else 6)
 
 
 class PosePrior(NamedTuple):

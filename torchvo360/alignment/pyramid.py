@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Bool
+from jaxtyping import Bool, Float, Float64
 from torch import Tensor
 
 from torchvo360.alignment.config import AlignConfig
@@ -57,14 +57,16 @@ def build_levels(inputs: Inputs, camera: Camera, config: AlignConfig) -> list[Le
 def _own_levels(inputs: Inputs, camera: Camera, config: AlignConfig, *, branches: bool) -> list[_Maps]:
     """Smooth and halve the one map that is given."""
     ref, tgt = inputs.ref[0], inputs.tgt[0]
-    known = inputs.known & _eroded(inputs.ref_finite[0], camera, config.blur_px, branches=branches)
+    rho, variance, known = inputs.ranges()
+    if inputs.ref_finite[0] is not None:
+        known = known & eroded(inputs.ref_finite[0], camera, config.blur_px, branches=branches)
     if config.saturation is not None and ref.shape[1] == 1:
         known = known & (ref[:, 0] < config.saturation)
-    confidence = _confidence(inputs, 0, camera, config.blur_px, branches=branches)
+    confidence = confidence_of(inputs, 0, camera, config.blur_px, branches=branches)
     weight = None if inputs.weight_ref is None else inputs.weight_ref[0]
     ref, tgt = blur(ref, camera, config.blur_px), blur(tgt, camera, config.blur_px)
     cameras = [level_camera(camera, level) for level in range(config.level_count(camera))]
-    ranges = _range_levels(inputs, known, cameras)
+    ranges = _range_levels(rho, variance, known, cameras)
     levels = [_Maps(camera, ref, tgt, *ranges[0], weight, confidence)]
     for at, each in zip(cameras[1:], ranges[1:], strict=True):
         ref, tgt = resample(ref, at), resample(tgt, at)
@@ -76,28 +78,30 @@ def _own_levels(inputs: Inputs, camera: Camera, config: AlignConfig, *, branches
 def _given_levels(inputs: Inputs, camera: Camera, *, branches: bool) -> list[_Maps]:
     """Take a pyramid as it is; only the ranges are brought to its sizes."""
     cameras = [camera.resized(ref.shape[-1], ref.shape[-2]) for ref in inputs.ref]
-    ranges = _range_levels(inputs, inputs.known, cameras)
+    ranges = _range_levels(*inputs.ranges(), cameras)
     levels = []
     for number, (ref, tgt, at) in enumerate(zip(inputs.ref, inputs.tgt, cameras, strict=True)):
         rho, variance, known = ranges[number]
-        confidence = _confidence(inputs, number, at, 0.0, branches=branches)
+        confidence = confidence_of(inputs, number, at, 0.0, branches=branches)
         weight = None if inputs.weight_ref is None else inputs.weight_ref[number]
-        levels.append(_Maps(at, ref, tgt, rho, variance, known & inputs.ref_finite[number], weight, confidence))
+        finite = inputs.ref_finite[number]
+        known = known if finite is None else known & finite
+        levels.append(_Maps(at, ref, tgt, rho, variance, known, weight, confidence))
     return levels
 
 
 def _range_levels(
-    inputs: Inputs, known: Bool[Tensor, "B H W"], cameras: list[Camera]
+    rho: Tensor, variance: Tensor | None, known: Bool[Tensor, "B H W"], cameras: list[Camera]
 ) -> list[tuple[Tensor, Tensor | None, Tensor]]:
     """Return inverse ranges, their variances and where they are known, of every level.
 
     Errors of neighbouring ranges go together: their mean is no surer than they are.
     """
-    rho = masked_pyramid(inputs.rho, known, cameras)
-    if inputs.variance is None:
-        return [(mean, None, certain) for mean, certain in rho]
-    variance = masked_pyramid(inputs.variance, known, cameras)
-    return [(mean, spread, certain) for (mean, certain), (spread, _) in zip(rho, variance, strict=True)]
+    means = masked_pyramid(rho, known, cameras)
+    if variance is None:
+        return [(mean, None, certain) for mean, certain in means]
+    spreads = masked_pyramid(variance, known, cameras)
+    return [(mean, spread, certain) for (mean, certain), (spread, _) in zip(means, spreads, strict=True)]
 
 
 def _laid_out(maps: _Maps, intrinsics: Tensor | None, whole: Camera, saturation: float | None) -> Level:
@@ -106,17 +110,12 @@ def _laid_out(maps: _Maps, intrinsics: Tensor | None, whole: Camera, saturation:
     each = maps.known * (area / area.mean())
     if maps.weight is not None:
         each = each * maps.weight
-    k = None
     if intrinsics is None:
-        ray = camera.ray_grid(dtype=dtype, device=device)[None]
+        ray, k = rays_of(camera.ray_grid(dtype=dtype, device=device)[None]), None
     else:
-        size = intrinsics.new_tensor([camera.width / whole.width, camera.height / whole.height] * 2)
-        k = intrinsics * size
-        fx, fy, cx, cy = k[:, :, None, None].unbind(1)
-        ray = camera.ray(camera.pixel_grid(dtype=torch.float64, device=device), (fx, fy, cx, cy)).to(dtype)
-        k = k.to(dtype)
+        ray, k = own_rays(intrinsics, camera, whole, dtype)
     reference = Reference(
-        ray=ray.permute(0, 3, 1, 2).flatten(2).contiguous(),
+        ray=ray,
         rho=maps.rho.flatten(1).contiguous(),
         value=maps.ref.flatten(2).contiguous(),
         weight=each.flatten(1).contiguous(),
@@ -125,17 +124,32 @@ def _laid_out(maps: _Maps, intrinsics: Tensor | None, whole: Camera, saturation:
     return Level(reference, make_target(maps.tgt, camera, maps.confidence, saturation, k))
 
 
-def _confidence(inputs: Inputs, number: int, camera: Camera, blur_px: float, *, branches: bool) -> Tensor | None:
+def rays_of(grid: Float[Tensor, "B H W 3"]) -> Float[Tensor, "B 3 N"]:
+    """Return rays of pixels as the kernel takes them."""
+    return grid.permute(0, 3, 1, 2).flatten(2).contiguous()
+
+
+def own_rays(
+    intrinsics: Float64[Tensor, "B 4"], camera: Camera, whole: Camera, dtype: torch.dtype
+) -> tuple[Float[Tensor, "B 3 N"], Float[Tensor, "B 4"]]:
+    """Return the rays of a level's pixels by intrinsics in pixels of the whole image, and those of the level."""
+    k = intrinsics * intrinsics.new_tensor([camera.width / whole.width, camera.height / whole.height] * 2)
+    fx, fy, cx, cy = k[:, :, None, None].unbind(1)
+    ray = camera.ray(camera.pixel_grid(dtype=torch.float64, device=k.device), (fx, fy, cx, cy)).to(dtype)
+    return rays_of(ray), k.to(dtype)
+
+
+def confidence_of(inputs: Inputs, number: int, camera: Camera, blur_px: float, *, branches: bool) -> Tensor | None:
     """Return the weight of each pixel of the target; None where all count fully."""
     weight = None if inputs.weight_tgt is None else inputs.weight_tgt[number]
     finite = inputs.tgt_finite[number]
-    if branches and bool(finite.all()):
+    if finite is None or (branches and bool(finite.all())):
         return weight
-    usable = _eroded(finite, camera, blur_px, branches=branches).to(inputs.tgt[number].dtype)
+    usable = eroded(finite, camera, blur_px, branches=branches).to(inputs.tgt[number].dtype)
     return usable if weight is None else usable * weight
 
 
-def _eroded(usable: Bool[Tensor, "B H W"], camera: Camera, blur_px: float, *, branches: bool) -> Bool[Tensor, "B H W"]:
+def eroded(usable: Bool[Tensor, "B H W"], camera: Camera, blur_px: float, *, branches: bool) -> Bool[Tensor, "B H W"]:
     """Drop the pixels near unusable ones, whose values smoothing by `blur_px` and interpolation would mix in."""
     if branches and bool(usable.all()):
         return usable

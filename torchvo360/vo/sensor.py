@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 from typing import NamedTuple
 
+import cv2
 import numpy as np
 import torch
 import torch.nn.functional as F
@@ -65,12 +66,21 @@ def read_depth(
     rho = torch.where(known, rho, 0.0)
     # Neighbours that are not known contradict nothing: they are least in both maxima.
     sides = torch.stack([torch.where(known, rho, -torch.inf), torch.where(known, -rho, -torch.inf)])
-    most = F.max_pool2d(pad_image(sides, camera, 1)[None], 3, stride=1)[0]
-    known = known & (most.sum(0) <= config.edge * rho)
+    known = known & (_most_around(sides, camera).sum(0) <= config.edge * rho)
     if not bool(known.any()):
         return None
     variance = (config.relative * rho).square() + config.constant**2
     return Sensed(torch.where(known, rho, 0.0), torch.where(known, variance, torch.inf))
+
+
+def _most_around(values: Float[Tensor, "K H W"], camera: Camera) -> Float[Tensor, "K H W"]:
+    """Return the largest of each pixel's 3 x 3."""
+    padded = pad_image(values, camera, 1)
+    if values.device.type != "cpu":
+        return F.max_pool2d(padded[None], 3, stride=1)[0]
+    # Torch takes seventy times as long on one thread.
+    square = np.ones((3, 3), np.uint8)
+    return torch.from_numpy(np.stack([cv2.dilate(plane.numpy(), square)[1:-1, 1:-1] for plane in padded]))
 
 
 def check_depth(frame: Frame, camera: Camera) -> None:

@@ -1,7 +1,18 @@
 """The hot kernel as one compiled pass: `linearize` for float32 on the CPU without gradients; needs the extra `fast`."""
 
-from torchvo360.backends.numba.comparison import compare
-from torchvo360.backends.numba.linearize import linearize, serves
+from torchvo360.backends.numba.comparison import brightness_moments, compare, explained_energy
+from torchvo360.backends.numba.linearize import kernel, linearize, serves
 from torchvo360.backends.numba.solve import Outcomes, Rules, Solved, solve_pairs
 
-__all__ = ["Outcomes", "Rules", "Solved", "compare", "linearize", "serves", "solve_pairs"]
+__all__ = [
+    "Outcomes",
+    "Rules",
+    "Solved",
+    "brightness_moments",
+    "compare",
+    "explained_energy",
+    "kernel",
+    "linearize",
+    "serves",
+    "solve_pairs",
+]

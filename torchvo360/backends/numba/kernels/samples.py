@@ -21,6 +21,24 @@ def keep(s, n, scale, residual, value, weight, slope2):
         slope2[i] = (gx * gx + gy * gy + gz * gz) * scale
 
 
+@compiled()
+def sample_pair(s, index, b, points, images, T, affine, k, optics, saturation, scale, out):
+    """Write residuals, values, weights and squared gradients of all samples of pair b, [4, C, N]."""
+    kind, _, _, polar2 = optics
+    ray, rho, value, weight = element(points[0], b), element(points[1], b), element(points[2], b), element(points[3], b)
+    image, each_k = element(images[0], b), element(k, b)
+    gain, offset = f4(math.exp(f4(affine[b, 0]))), f4(affine[b, 1])
+    _, C, N = out.shape
+    for at in range(0, N, BLOCK):
+        end = min(at + BLOCK, N)
+        n = end - at
+        place_block(s, index, at, end, ray, rho, weight, images, b, T[b], each_k, optics)
+        for c in range(C):
+            gather(s, index, n, image[c].reshape(-1), image.shape[2])
+            compare(s, n, kind, value[c, at:end], gain, offset, saturation, each_k[0], each_k[1], polar2)
+            keep(s, n, scale, out[0, c, at:end], out[1, c, at:end], out[2, c, at:end], out[3, c, at:end])
+
+
 @compiled(nogil=True)
 def sample_pairs(points, images, T, affine, k, optics, saturation, scale, out):
     """Write residuals, values, weights and squared gradients of all samples.
@@ -34,21 +52,8 @@ def sample_pairs(points, images, T, affine, k, optics, saturation, scale, out):
         optics: The camera.
         saturation: Values from this on weigh nothing.
         scale: What squared gradients are multiplied by, float32.
-        out: [4, B, C, N], float32.
+        out: [B, 4, C, N], float32.
     """
-    kind, _, _, polar2 = optics
     s, index = np.empty(SCRATCH, f4), np.empty(BLOCK, np.uint32)
-    _, B, C, N = out.shape
-    for b in range(B):
-        ray, rho, value, weight = element(points[0], b), element(points[1], b), element(points[2], b), points[3]
-        image, each_k = element(images[0], b), element(k, b)
-        gain, offset = f4(math.exp(f4(affine[b, 0]))), f4(affine[b, 1])
-        for at in range(0, N, BLOCK):
-            end = min(at + BLOCK, N)
-            n = end - at
-            place_block(s, index, at, end, ray, rho, element(weight, b), images, b, T[b], each_k, optics)
-            for c in range(C):
-                gather(s, index, n, image[c].reshape(-1), image.shape[2])
-                compare(s, n, kind, value[c, at:end], gain, offset, saturation, each_k[0], each_k[1], polar2)
-                found = out[:, b, c, at:end]
-                keep(s, n, scale, found[0], found[1], found[2], found[3])
+    for b in range(len(T)):
+        sample_pair(s, index, b, points, images, T, affine, k, optics, saturation, scale, out[b])

@@ -9,14 +9,14 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from torchvo360.backends import eager, numba
+from torchvo360.backends import compiled, eager, numba
 from torchvo360.backends.transforms import in_transform
 from torchvo360.checks import InputError, check_choice
 from torchvo360.residuals.direct import Reference, Target
 from torchvo360.residuals.normal import NormalEquations
 from torchvo360.residuals.weights import LossConfig
 
-BACKENDS = ("auto", "eager", "numba")
+BACKENDS = ("auto", "eager", "numba", "compiled")
 
 _asked = "auto"
 
@@ -31,8 +31,11 @@ def linearize(
     noise: float = 4 / 255,
 ) -> NormalEquations:
     """Linearise as `backends.eager.linearize` does, on the backend asked for, else the fastest there is for these."""
-    compiled = use_numba() and numba.serves(reference, target, T_tgt_ref, affine)
-    return (numba if compiled else eager).linearize(reference, target, T_tgt_ref, affine, loss, noise=noise)
+    problem = (reference, target, T_tgt_ref, affine)
+    if _asked == "compiled" and not in_transform() and compiled.serves(*problem):
+        return compiled.linearize(*problem, loss, noise=noise)
+    chosen = numba if use_numba() and numba.serves(*problem) else eager
+    return chosen.linearize(*problem, loss, noise=noise)
 
 
 @contextmanager
@@ -40,15 +43,18 @@ def backend(name: str) -> Iterator[None]:
     """Compute on a backend while this is entered, in all threads.
 
     Args:
-        name: auto; eager: torch alone; numba: as auto, but refused where it is not installed.
+        name: auto; eager: torch alone; numba: as auto, but refused where it is not installed; compiled: `linearize` by
+            `torch.compile` where it serves, and all else as auto.
 
     Raises:
-        InputError: It is none of these, or numba is not installed.
+        InputError: It is none of these, or numba or a C++ compiler is not installed.
     """
     global _asked
     check_choice("backend", name, BACKENDS)
     if name == "numba" and not has_numba():
         raise InputError("backend: expected numba to be installed (pip install 'torchvo360[fast]'), got none.")
+    if name == "compiled" and not compiled.has_compiler():
+        raise InputError(compiled.NO_COMPILER)
     before, _asked = _asked, name
     try:
         yield

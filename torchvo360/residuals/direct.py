@@ -300,10 +300,14 @@ def weight_slope_rows(
 
     dI/drho = G . t / s, and a step moves t by v + w x t.
     """
+    return torch.stack(six_slopes(samples, factor, t_tgt_ref), 1).flatten(2)
+
+
+def six_slopes(samples: Samples, factor: Float[Tensor, "B C N"], t_tgt_ref: Float[Tensor, "B 3"]) -> tuple[Tensor, ...]:
+    """Return the rows of `weight_slope_rows` as six tensors [B, C, N]."""
     tx, ty, tz = t_tgt_ref[..., None, None].unbind(1)
     Gx, Gy, Gz = (component * (samples.inv_scale * -factor) for component in samples.G)
-    rows = [Gx, Gy, Gz, ty * Gz - tz * Gy, tz * Gx - tx * Gz, tx * Gy - ty * Gx]
-    return torch.stack(rows, 1).flatten(2)
+    return Gx, Gy, Gz, ty * Gz - tz * Gy, tz * Gx - tx * Gz, tx * Gy - ty * Gx
 
 
 def row_sums(samples: Samples, pull: Float[Tensor, "B C N"]) -> Float64[Tensor, "B 8"]:

@@ -36,7 +36,7 @@ def has_compiler() -> bool:
 
 
 def serves(reference: Reference, target: Target, T_tgt_ref: Tensor, affine: Tensor) -> bool:
-    """Return whether `linearize` takes these: many points, a full panorama or a pinhole, float32 on the CPU, no gradient."""
+    """Return whether `linearize` takes these: many points, a known camera, float32 on the CPU, and no gradient."""
     inputs = (reference.ray, reference.rho, reference.value, reference.weight, reference.variance)
     images = (target.padded, target.confidence, target.intrinsics)
     tensors = [value for value in (*inputs, *images) if value is not None]
@@ -72,8 +72,8 @@ def linearize(
         raise InputError(NO_COMPILER)
     if not serves(reference, target, T_tgt_ref, affine):
         raise InputError(
-            f"linearize: expected more than {FEW_POINTS} points, float32 on the CPU without gradients, and a full panorama "
-            "or a pinhole, for torch.compile, got others."
+            f"linearize: expected more than {FEW_POINTS} points of a full panorama or a pinhole, float32 on the CPU "
+            "without gradients, for torch.compile, got others."
         )
     camera = target.camera
     _, fy, _, _ = camera.intrinsics

@@ -95,15 +95,17 @@ def ratio_of(name: str, seconds: float = 2.0) -> float:
 def peak_images() -> float:
     """Return the most memory that the eager kernel takes for a pair of 1024 x 512, in float32 images of that size.
 
-    It is measured in a process of its own: here much may lie free already.
+    It is measured in a process of its own that has given back what lay free in it.
     """
     code = """if True:
-        import torch
-        from ratios import LossConfig, dense, eager, memory_mb, reset_peak
+        import ctypes, torch
+        from peers import memory_mb, reset_peak
+        from ratios import LossConfig, dense, eager
         torch.set_num_threads(1)
         torch.set_grad_enabled(False)
         problem = dense(1, 1024, 512)
         eager.linearize(*dense(1, 64, 32), LossConfig())
+        ctypes.CDLL(None).malloc_trim(0)
         reset_peak()
         before_mb = memory_mb("VmRSS")
         eager.linearize(*problem, LossConfig())

@@ -1,6 +1,6 @@
 """What one linearisation costs against a hand-written AVX-512 pass in C++, in one run, on one thread.
 
-    python benchmarks/bench_linearize.py --yardstick ../shared/yardstick
+    python benchmarks/bench_linearize.py --yardstick ../shared/yardstick [--compiled]
 
 The yardstick's folder holds `common.py` (the problem and the C++ calls) and `kernel.cpp`, which is compiled into a
 temporary folder with g++. Both passes linearise the same pairs: spherical, eight parameters, Huber loss; the yardstick
@@ -8,6 +8,7 @@ samples a precomputed gradient field with the image, the library takes the deriv
 the image itself. Errors of H and g are against float64 sums of the same numbers. Timings alternate, so that both meet
 the same load; the ratios of neighbouring timings are what to trust. Where numba is installed, its kernel has columns of
 its own; its start is timed in a process of its own, and how it serves the few points of tracking against the eager one.
+--compiled adds the kernel of torch.compile, after a minute or two of compiling. Times are of CPU.
 """
 
 import argparse
@@ -27,7 +28,7 @@ import torch
 from torch import Tensor
 
 from torchvo360 import Equirectangular
-from torchvo360.backends import eager, numba
+from torchvo360.backends import compiled, eager, numba
 from torchvo360.backends.select import has_numba
 from torchvo360.residuals.direct import Reference, Target, make_target
 from torchvo360.residuals.normal import NormalEquations
@@ -99,12 +100,15 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--yardstick", type=Path, default=YARDSTICK, help="folder with common.py and kernel.cpp")
     parser.add_argument("--seconds", type=float, default=4.0, help="time spent on each size and kernel")
+    parser.add_argument("--compiled", action="store_true", help="measure torch.compile's kernel, too")
     arguments = parser.parse_args()
     torch.set_num_threads(1)
     torch.set_grad_enabled(False)
     kernels: dict[str, Linearize] = {"eager": eager.linearize}
     if has_numba():
         kernels["numba"] = numba.linearize
+    if arguments.compiled:
+        kernels["compiled"] = compiled.linearize
     common = load_yardstick(arguments.yardstick.resolve())
     middle = statistics.median
     with tempfile.TemporaryDirectory() as folder:
@@ -112,7 +116,7 @@ def main() -> None:
         library = common.build(name=str(Path(folder) / "libkernel.so"))
         print(f"torch {torch.__version__}, one thread, load {os.getloadavg()[0]:.1f}")
         print(
-            "B x H x W     | kernel | C++ ms min, med | kernel ms      | ratio     | error of H, g (cell borders too)"
+            "B x H x W     | kernel   | C++ ms min, med | kernel ms      | ratio     | error of H, g (cell borders too)"
         )
         for B, H, W in common.SIZES:
             data = common.Data(B, H, W)
@@ -125,7 +129,7 @@ def main() -> None:
                 cpp, ours = zip(*times, strict=True)
                 outer, inner = error_of(linearize, problem, loss), error_of(linearize, inside, loss)
                 print(
-                    f"{B:2} x {H:3} x {W:4} | {name:6} | {min(cpp):6.2f} {middle(cpp):6.2f} | "
+                    f"{B:2} x {H:3} x {W:4} | {name:8} | {min(cpp):6.2f} {middle(cpp):6.2f} | "
                     f"{min(ours):6.2f} {middle(ours):6.2f} | "
                     f"{min(ours) / min(cpp):4.1f} {middle(b / a for a, b in times):4.1f} | "
                     f"{inner[0]:.0e} {inner[1]:.0e} ({outer[0]:.0e} {outer[1]:.0e})",
@@ -135,8 +139,8 @@ def main() -> None:
         return
     for B in (1, 8):
         problem = few_points(B, 3000)
-        plain, compiled = (partial(linearize, *problem, LossConfig()) for linearize in kernels.values())
-        times = alternate(plain, compiled, arguments.seconds)
+        plain, fast = (partial(kernels[name], *problem, LossConfig()) for name in ("eager", "numba"))
+        times = alternate(plain, fast, arguments.seconds)
         torchs, ours = (min(column) * 1e3 for column in zip(*times, strict=True))
         print(f"{B} x 3000 points: eager {torchs:.0f} us, numba {ours:.0f} us, ratio {ours / torchs:.2f}")
     starts = [seconds_to_start() for _ in range(5)]

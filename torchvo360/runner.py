@@ -16,6 +16,7 @@ from jaxtyping import Int64
 from torch import Tensor, nn
 from tqdm import tqdm
 
+from torchvo360.backends import backend
 from torchvo360.checks import InputError
 from torchvo360.data import Frame, Trajectory
 from torchvo360.data.prefetch import prefetched
@@ -101,6 +102,7 @@ def run(config: RunConfig, *, config_yaml: str = "") -> Outcome:
     truth = sequence.truth if config.truth is None else _read_truth(config.truth)
     depth = open_depth(config.depth)
     with (
+        backend(config.backend),
         output_folder(config.out, sequence.name, overwrite=config.overwrite) as folder,
         _threads(config.threads),
         torch.inference_mode(),

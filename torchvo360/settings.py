@@ -10,6 +10,7 @@ import torch
 from jaxtyping import Float64
 from torch import Tensor
 
+from torchvo360.backends import BACKENDS
 from torchvo360.cameras import Lens
 from torchvo360.checks import InputError, check_choice, check_finite_number
 from torchvo360.data.calibration import pose_of_numbers
@@ -239,6 +240,9 @@ class RunConfig:
     """Of the odometry's random samples."""
     threads: int | None = 1
     """Threads to compute with: small operations gain little from more; null leaves it to PyTorch and OpenCV."""
+    backend: str = "auto"
+    """What computes on the CPU: numba where it is installed (auto), eager torch alone, numba or else nothing, or
+    compiled, which is auto with the alignment of images by torch.compile: it needs a C++ compiler and half a minute."""
     device: str = "cpu"
     """cpu or cuda."""
     out: str | None = None
@@ -264,6 +268,7 @@ class RunConfig:
         check_choice("plot", self.plot, ("auto", "true", "false"))
         check_choice("viz", self.viz, VIEWERS)
         check_finite_number("report_mb", self.report_mb, above=0.0)
+        check_choice("backend", self.backend, BACKENDS)
         check_choice("device", self.device, ("cpu", "cuda"))
         if not self.input:
             raise InputError("input: expected a video, a folder of images or a glob pattern, got an empty name.")

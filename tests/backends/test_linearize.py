@@ -13,7 +13,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from torchvo360 import lie
-from torchvo360.backends import eager, numba
+from torchvo360.backends import compiled, eager, numba
 from torchvo360.backends.eager import linearize
 from torchvo360.cameras import Camera, Equirectangular, Pinhole
 from torchvo360.image import pad_image
@@ -25,7 +25,10 @@ PLANE = Pinhole(96, 72, 80.0, 84.0, 47.1, 36.4)
 CAMERAS = pytest.mark.parametrize("camera", [SPHERE, PLANE], ids=["sphere", "pinhole"])
 CHANNELS = pytest.mark.parametrize("channels", [1, 3])
 HUBER = LossConfig(scale=0.05)
-BACKENDS = pytest.mark.parametrize("backend", [eager, numba], ids=["eager", "numba"])
+BACKENDS = pytest.mark.parametrize("backend", [eager, numba, compiled], ids=["eager", "numba", "compiled"])
+
+COMPILED = {(True, 1, False), (False, 3, True)}
+"""Panorama or not, channels and variance of what is compiled to be compared."""
 
 
 def texture(camera: Camera, *batch: int, seed: int = 0) -> Float[Tensor, "*batch H W"]:
@@ -176,6 +179,8 @@ def test_float64_equals_the_textbook(camera, channels, loss):
 def test_float32_equals_float64_truth(backend, camera, channels, variance):
     if backend is numba:
         pytest.importorskip("numba")
+    if backend is compiled and (not compiled.has_compiler() or (camera.wraps, channels, variance) not in COMPILED):
+        pytest.skip("half a minute of compiling for each: two stand for all")
     reference, target, T, affine = problem(camera, 4, channels, variance=variance)
     reference = off_cell_borders(camera, reference, T)
     found = backend.linearize(reference, target, T, affine, HUBER)

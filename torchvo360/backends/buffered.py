@@ -79,7 +79,8 @@ def serves(reference: Reference, target: Target, T_tgt_ref: Tensor, affine: Tens
 
 def room_for(reference: Reference) -> Room:
     """Return this thread's buffers for points."""
-    key = (*reference.value.shape, reference.value.dtype)
+    B, C, N = reference.value.shape
+    key = (B, C, N, reference.value.dtype)
     room = _kept.rooms.pop(key, None)
     if room is None:
         room = Room.of(*key)

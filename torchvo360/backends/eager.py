@@ -101,12 +101,16 @@ def gram(
     samples: Samples, weighed: Weighed, t_tgt_ref: Float[Tensor, "B 3"], room: buffered.Room | None = None
 ) -> Float64[Tensor, "B 9 9"]:
     """Return `S W S^T` of the Jacobian's eight columns and the residual, with S in buffers where there are any."""
+    if room is not None:
+        root = torch.mul(samples.weight, weighed.weight, out=room.samples[3]).sqrt_()
+        S = _rows(samples, weighed, t_tgt_ref, root, room)
+        return _product(S, S)
     W = samples.weight * weighed.weight
-    if room is None and torch.is_grad_enabled():
+    if torch.is_grad_enabled():
         # Without the roots, whose slope is infinite where a weight is zero.
         S = _rows(samples, weighed, t_tgt_ref, torch.ones_like(W), None)
         return _product(S * W.flatten(1)[:, None], S)
-    S = _rows(samples, weighed, t_tgt_ref, W.sqrt(), room)
+    S = _rows(samples, weighed, t_tgt_ref, W.sqrt(), None)
     return _product(S, S)
 
 

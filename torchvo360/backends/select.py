@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from torchvo360.backends import comparison, eager, numba
+from torchvo360.backends import comparison, compiled, eager, numba
 from torchvo360.backends.comparison import Comparison
 from torchvo360.backends.transforms import in_transform
 from torchvo360.checks import InputError, check_choice
@@ -17,7 +17,7 @@ from torchvo360.residuals.direct import Reference, Target
 from torchvo360.residuals.normal import NormalEquations
 from torchvo360.residuals.weights import LossConfig
 
-BACKENDS = ("auto", "eager", "numba")
+BACKENDS = ("auto", "eager", "numba", "compiled")
 
 _asked = "auto"
 
@@ -32,16 +32,19 @@ def linearize(
     noise: float = 4 / 255,
 ) -> NormalEquations:
     """Linearise as `backends.eager.linearize` does, on the backend asked for, else the fastest there is for these."""
-    compiled = use_numba() and numba.serves(reference, target, T_tgt_ref, affine)
-    return (numba if compiled else eager).linearize(reference, target, T_tgt_ref, affine, loss, noise=noise)
+    problem = (reference, target, T_tgt_ref, affine)
+    if _asked == "compiled" and not in_transform() and compiled.serves(*problem):
+        return compiled.linearize(*problem, loss, noise=noise)
+    chosen = numba if use_numba() and numba.serves(*problem) else eager
+    return chosen.linearize(*problem, loss, noise=noise)
 
 
 def compare(
     reference: Reference, target: Target, T_tgt_ref: Float[Tensor, "B 4 4"], affine: Float[Tensor, "B 2"]
 ) -> Comparison:
     """Compare as `backends.comparison.compare` does, on the backend asked for, else the fastest there is for these."""
-    compiled = use_numba() and numba.serves(reference, target, T_tgt_ref, affine)
-    return (numba if compiled else comparison).compare(reference, target, T_tgt_ref, affine)
+    chosen = numba if use_numba() and numba.serves(reference, target, T_tgt_ref, affine) else comparison
+    return chosen.compare(reference, target, T_tgt_ref, affine)
 
 
 @contextmanager
@@ -49,15 +52,18 @@ def backend(name: str) -> Iterator[None]:
     """Compute on a backend while this is entered, in all threads.
 
     Args:
-        name: auto; eager: torch alone; numba: as auto, but refused where it is not installed.
+        name: auto; eager: torch alone; numba: as auto, but refused where it is not installed; compiled: `linearize` by
+            `torch.compile` where it serves, and all else as eager.
 
     Raises:
-        InputError: It is none of these, or numba is not installed.
+        InputError: It is none of these, or numba or a C++ compiler is not installed.
     """
     global _asked
     check_choice("backend", name, BACKENDS)
     if name == "numba" and not has_numba():
         raise InputError("backend: expected numba to be installed (pip install 'torchvo360[fast]'), got none.")
+    if name == "compiled" and not compiled.has_compiler():
+        raise InputError(compiled.NO_COMPILER)
     before, _asked = _asked, name
     try:
         yield
@@ -71,7 +77,7 @@ def use_numba(*tensors: Tensor | None) -> bool:
     It serves what is on the CPU and asks for no derivative: neither backwards, nor forwards, nor by `torch.func`; and
     not what `torch.compile` compiles.
     """
-    return are_plain(*tensors) and _asked != "eager" and has_numba()
+    return are_plain(*tensors) and _asked in ("auto", "numba") and has_numba()
 
 
 def are_plain(*tensors: Tensor | None) -> bool:

@@ -58,6 +58,11 @@ class Equirectangular(Camera):
         """How many pixels go around the sphere; exactly the width when the image does."""
         return float(self.width) if self.wraps else abs(self.intrinsics[0]) * math.tau
 
+    @property
+    def _least_horizontal2(self) -> float | Tensor:
+        """cos(lat)^2 of the first row's centre."""
+        return math.sin(0.5 / self.intrinsics[1]) ** 2
+
     def _longitude_latitude(
         self, uv: Float[Tensor, "*batch 2"], k: Intrinsics | None = None
     ) -> tuple[Float[Tensor, "*batch"], Float[Tensor, "*batch"]]:
@@ -163,7 +168,7 @@ class Equirectangular(Camera):
         # there 1 / cos(lat) is held at that row's value, or G would grow without bound; G . ray stays 0.
         # Fresh results are written over while they are in the cache; each is mapped by `vmap` where what enters it is.
         horizontal2 = torch.addcmul(x * x, z, z)
-        inv_cos_lat = horizontal2.clamp_min(math.sin(0.5 / self.intrinsics[1]) ** 2).rsqrt_()
+        inv_cos_lat = horizontal2.clamp_min(self._least_horizontal2).rsqrt_()
         along_lat = g_v * fy
         radial = (along_lat * y).mul_(inv_cos_lat)
         turn = (g_u * fx * inv_cos_lat).mul_(inv_cos_lat)

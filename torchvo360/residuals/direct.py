@@ -290,19 +290,19 @@ def nine_rows(
     """Return the rows of `system_rows` as nine tensors [B, C, N]: in `out`, or new ones."""
     to = (None,) * 9 if out is None else out
     rx, ry, rz = samples.ray
-    Gx, Gy, Gz = (component * root_weight for component in samples.G)
-    minus = torch.neg(root_weight, out=to[7])
-    return (
+    # The last three rows are made last: until then they hold the gradient.
+    Gx, Gy, Gz = (torch.mul(part, root_weight, out=row) for part, row in zip(samples.G, to[6:], strict=True))
+    motion = (
         torch.mul(samples.rho, Gx, out=to[0]),
         torch.mul(samples.rho, Gy, out=to[1]),
         torch.mul(samples.rho, Gz, out=to[2]),
         torch.addcmul(torch.mul(ry, Gz, out=to[3]), rz, Gy, value=-1, out=to[3]),
         torch.addcmul(torch.mul(rz, Gx, out=to[4]), rx, Gz, value=-1, out=to[4]),
         torch.addcmul(torch.mul(rx, Gy, out=to[5]), ry, Gx, value=-1, out=to[5]),
-        torch.mul(samples.gained, minus, out=to[6]),
-        minus,
-        torch.mul(samples.residual, root_weight, out=to[8]),
     )
+    minus = torch.neg(root_weight, out=to[7])
+    gained = torch.mul(samples.gained, minus, out=to[6])
+    return *motion, gained, minus, torch.mul(samples.residual, root_weight, out=to[8])
 
 
 def weight_slope_rows(
@@ -312,10 +312,14 @@ def weight_slope_rows(
 
     dI/drho = G . t / s, and a step moves t by v + w x t.
     """
+    return torch.stack(six_slopes(samples, factor, t_tgt_ref), 1).flatten(2)
+
+
+def six_slopes(samples: Samples, factor: Float[Tensor, "B C N"], t_tgt_ref: Float[Tensor, "B 3"]) -> tuple[Tensor, ...]:
+    """Return the rows of `weight_slope_rows` as six tensors [B, C, N]."""
     tx, ty, tz = t_tgt_ref[..., None, None].unbind(1)
     Gx, Gy, Gz = (component * (samples.inv_scale * -factor) for component in samples.G)
-    rows = [Gx, Gy, Gz, ty * Gz - tz * Gy, tz * Gx - tx * Gz, tx * Gy - ty * Gx]
-    return torch.stack(rows, 1).flatten(2)
+    return Gx, Gy, Gz, ty * Gz - tz * Gy, tz * Gx - tx * Gz, tx * Gy - ty * Gx
 
 
 def row_sums(samples: Samples, pull: Float[Tensor, "B C N"]) -> Float64[Tensor, "B 8"]:

@@ -104,6 +104,7 @@ def _array(value: Tensor) -> np.ndarray:
 
 
 def intrinsics_of(target: Target) -> np.ndarray:
+    """Return (fx, fy, cx, cy) of each target, or the ones that all share."""
     if target.intrinsics is None:
         return np.array([target.camera.intrinsics], np.float32)
     return _array(target.intrinsics)
@@ -120,6 +121,7 @@ def optics_of(target: Target) -> tuple[int, bool, bool, np.float32]:
 
 
 def loss_of(loss: LossConfig, saturation: float | None, noise: float) -> tuple[int | np.float32, ...]:
+    """Return a loss as kernels take it: kind, scale, degrees of freedom, cut-off, cost there, saturation, noise."""
     kind, *numbers = _robust(loss.name, loss.scale, loss.degrees_of_freedom, loss.cutoff)
     return (kind, *numbers, np.float32(math.inf if saturation is None else saturation), np.float32(noise))
 

@@ -31,10 +31,10 @@ class Room(NamedTuple):
     """A thread's buffers, cut for one size of chunks. What they hold means nothing; S is zero behind its rows."""
 
     Y: Float[Tensor, "B 3 N"]
-    points: tuple[Tensor, Tensor, Tensor]
-    """[B, 1, N]."""
-    samples: tuple[Tensor, Tensor, Tensor, Tensor, Tensor]
-    """[B, C, N]."""
+    points: tuple[Tensor, ...]
+    """Three [B, 1, N]."""
+    samples: tuple[Tensor, ...]
+    """Five [B, C, N]."""
     corner: Int64[Tensor, "B 1 N"]
     index: Int64[Tensor, "B C N"]
     S: Float[Tensor, "B 9 M"]

@@ -268,7 +268,7 @@ def theseus(mode: str) -> Solver:
     """Return Theseus' Levenberg-Marquardt, differentiating by itself in a mode."""
 
     def run(pairs: Pairs) -> Solved:
-        import theseus as th
+        import theseus as th  # pyright: ignore[reportMissingImports]: optional
 
         problem, B = Problem.of(pairs), len(pairs.ref)
         N = problem.value.shape[1]
@@ -278,10 +278,10 @@ def theseus(mode: str) -> Solver:
 
         def error(optim_vars: list, aux_vars: list) -> Tensor:
             pose, affine = (variable.tensor for variable in optim_vars)
-            fields = [variable.tensor for variable in aux_vars]
+            point, value, wrapped = (variable.tensor for variable in aux_vars)
             return torch.stack(
                 [
-                    residual(pose[k, :, :3], pose[k, :, 3], affine[k], *(field[k] for field in fields), problem.root)
+                    residual(pose[k, :, :3], pose[k, :, 3], affine[k], point[k], value[k], wrapped[k], problem.root)
                     for k in range(len(pose))
                 ]
             )

@@ -31,12 +31,12 @@ class Room(NamedTuple):
     """A thread's buffers, cut for one size of chunks. What they hold means nothing; S is zero behind its rows."""
 
     Y: Float[Tensor, "B 3 N"]
-    points: tuple[Tensor, Tensor, Tensor]
-    """[B, 1, N]."""
-    samples: tuple[Tensor, Tensor, Tensor, Tensor, Tensor]
-    """[B, C, N]."""
+    points: tuple[Tensor, ...]
+    """Three [B, 1, N]."""
+    samples: tuple[Tensor, ...]
+    """Five [B, C, N]."""
     corner: Int64[Tensor, "B 1 N"]
-    index: Int64[Tensor, "B C N"]
+    taken: Int64[Tensor, "B C N"]
     S: Float[Tensor, "B 9 M"]
     rows: tuple[Tensor, ...]
     """S as nine tensors [B, C, N]."""
@@ -52,7 +52,7 @@ class Room(NamedTuple):
                 points=torch.empty(3, B, 1, N, dtype=dtype).unbind(),
                 samples=torch.empty(5, B, C, N, dtype=dtype).unbind(),
                 corner=corner,
-                index=corner if C == 1 else torch.empty(B, C, N, dtype=torch.int64),
+                taken=corner if C == 1 else torch.empty(B, C, N, dtype=torch.int64),
                 S=S,
                 rows=S[..., : C * N].unflatten(2, (C, N)).unbind(1),
             )
@@ -152,7 +152,7 @@ def _interpolate(padded: Float[Tensor, "B C Hp Wp"], taps: Taps, room: Room) -> 
     index = room.corner
     if C > 1:
         images = torch.arange(B)[:, None] * (C - 1) + torch.arange(C)
-        index = torch.add(index, images[..., None], alpha=height * taps.pitch, out=room.index)
+        index = torch.add(index, images[..., None], alpha=height * taps.pitch, out=room.taken)
     index, flat = index.reshape(-1), padded.reshape(-1)
     upper_left, upper_right, lower_left, lower_right = room.samples[:4]
     for shift, corner in zip((0, 1, taps.pitch, taps.pitch + 1), room.samples, strict=False):

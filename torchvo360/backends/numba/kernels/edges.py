@@ -12,7 +12,7 @@ import math
 import numpy as np
 
 from torchvo360.backends.numba.kernels.geometry import hide_unseen, locate, project_pinhole, project_sphere, warp, wrap
-from torchvo360.backends.numba.kernels.jit import FAST, compiled
+from torchvo360.backends.numba.kernels.jit import FAST, compiled, inlined
 from torchvo360.backends.numba.kernels.lookup import compare, doubt, gather
 from torchvo360.backends.numba.kernels.prefetch import fetch_cells
 from torchvo360.backends.numba.kernels.rows import add_products, build_rows
@@ -63,7 +63,7 @@ LEAST = f4(1e-6)
 """Weights below this are none."""
 
 
-@compiled(nogil=True)
+@compiled()
 def pack(ray, rho, value, weight, host, affine):
     """Bring points into blocks.
 
@@ -113,7 +113,7 @@ def pack(ray, rho, value, weight, host, affine):
     return (samples, own, blocks), count
 
 
-@compiled(nogil=True)
+@compiled()
 def begin_cross(K, points):
     """Return [8 K, N], zero in the rows of the points' hosts; the others are for `add_target` to write."""
     _, _, blocks = points
@@ -125,7 +125,7 @@ def begin_cross(K, points):
     return cross
 
 
-@compiled()
+@inlined()
 def relate(T_target, T_host, out):
     """Write T_target inv(T_host)."""
     for r in range(3):
@@ -140,7 +140,7 @@ def relate(T_target, T_host, out):
     out[3, 0], out[3, 1], out[3, 2], out[3, 3] = 0.0, 0.0, 0.0, 1.0
 
 
-@compiled()
+@inlined()
 def aim(s, index, n, block, T, image, k, optics):
     """Find where a block's samples lie in the image, and ask for its pixels there."""
     padded, confidence = image
@@ -163,7 +163,7 @@ def aim(s, index, n, block, T, image, k, optics):
         fetch_cells(index, n, confidence.reshape(-1), width + 2)
 
 
-@compiled()
+@inlined()
 def look(s, index, n, block, image, k, optics, loss, gain, offset):
     """Look samples up, compare them and weigh what comes out."""
     padded, confidence = image
@@ -177,7 +177,7 @@ def look(s, index, n, block, image, k, optics, loss, gain, offset):
     weigh(s, n, loss_kind, scale, freedom, cutoff, most, False)
 
 
-@compiled(fastmath=FAST)
+@inlined(fastmath=FAST)
 def average(s, own):
     """Find the points' weights in view and their mean energies, -1 where too little of the pattern is seen."""
     for i in range(POINTS):
@@ -191,7 +191,7 @@ def average(s, own):
         s[MEAN + i] = cost / max(total, LEAST) if seen else -ONE
 
 
-@compiled(fastmath=FAST)
+@inlined(fastmath=FAST)
 def refuse(s, limit):
     """Let samples of points that are outliers or hardly seen weigh nothing."""
     for i in range(POINTS):
@@ -201,7 +201,7 @@ def refuse(s, limit):
             s[EACH + p * POINTS + i] *= good
 
 
-@compiled(fastmath=FAST)
+@inlined(fastmath=FAST)
 def place(s, n, kind, block, T):
     """Move the samples' rays and inverse ranges to where another pose sees them."""
     warp(s, n, block[0], block[1], block[2], block[3], block[4], T)
@@ -220,7 +220,7 @@ def place(s, n, kind, block, T):
         s[RHO + i] *= inv
 
 
-@compiled(fastmath=FAST)
+@inlined(fastmath=FAST)
 def weigh_residuals(s, n):
     """Write the last two rows of the system alone: roots of the weights, negative, and weighted residuals."""
     for i in range(n):
@@ -229,7 +229,7 @@ def weigh_residuals(s, n):
         s[S8 + i] = root * s[RESIDUAL + i]
 
 
-@compiled(fastmath=FAST)
+@inlined(fastmath=FAST)
 def derive_by_rho(s, n, T):
     """Write the weighted derivatives by rho, G . t / s."""
     t0, t1, t2 = f4(T[0, 3]), f4(T[1, 3]), f4(T[2, 3])
@@ -237,7 +237,7 @@ def derive_by_rho(s, n, T):
         s[ALONG + i] = -(s[GX + i] * t0 + s[GY + i] * t1 + s[GZ + i] * t2) * s[INV + i] * s[S7 + i]
 
 
-@compiled(fastmath=FAST)
+@inlined(fastmath=FAST)
 def sum_pattern(s, row):
     """Sum a row times the derivative by rho over the pattern."""
     for i in range(POINTS):
@@ -247,14 +247,14 @@ def sum_pattern(s, row):
         s[PART + i] = total
 
 
-@compiled(fastmath=FAST)
+@inlined(fastmath=FAST)
 def add_part(s, n, total):
     """Add the last sums to the points'."""
     for i in range(n):
         total[i] += s[PART + i]
 
 
-@compiled(fastmath=FAST)
+@inlined(fastmath=FAST)
 def count_edges(s, n, limit, energy, inliers):
     """Add the points' energies, those of outliers up to the limit; return how many are seen."""
     seen = 0
@@ -267,7 +267,7 @@ def count_edges(s, n, limit, energy, inliers):
     return seen
 
 
-@compiled(fastmath=FAST)
+@inlined(fastmath=FAST)
 def turn_back(d, T, gain):
     """Find the mixed derivatives of the hosts from those of the target, by -Ad^T (mathematics.md, section 6)."""
     for c in range(3):
@@ -285,7 +285,7 @@ def turn_back(d, T, gain):
         d[15 * POINTS + i] = -d[7 * POINTS + i] * gain
 
 
-@compiled(fastmath=FAST)
+@inlined(fastmath=FAST)
 def add_cross(s, d, T, gain, by_target, by_host, first, last):
     """Write the mixed derivatives of the target, and add those of the host."""
     for c in range(8):
@@ -301,7 +301,7 @@ def add_cross(s, d, T, gain, by_target, by_host, first, last):
             host[i] += d[(8 + c) * POINTS + i]
 
 
-@compiled(nogil=True)
+@compiled()
 def add_target(j, P, ask, limit, points, T, T_first, affine, image, k, optics, loss, means, sums, cross, M):
     """Compare all points with one keyframe that is not their host.
 

@@ -8,7 +8,7 @@ import math
 
 import numpy as np
 
-from torchvo360.backends.numba.kernels.jit import compiled
+from torchvo360.backends.numba.kernels.jit import compiled, inlined
 from torchvo360.backends.numba.kernels.scratch import f4
 from torchvo360.backends.numba.kernels.sight import desk, see
 
@@ -20,7 +20,7 @@ START, TOWARDS, PHI, SINE, SIGMA, MIDDLE, WIDTH, SLOPE2, EACH = 0, 3, 6, 7, 8, 9
 """What is kept of a point: its great circle, the interval, and the mean square slope along the curve."""
 
 
-@compiled()
+@inlined()
 def _circle(ray, i, T, epipole, keep):
     """Write a point's great circle and return its direction there as seen in the reference."""
     for row in range(3):
@@ -40,19 +40,19 @@ def _circle(ray, i, T, epipole, keep):
     )
 
 
-@compiled()
+@inlined()
 def _angle(rho, baseline, keep):
     """Return where a point of this inverse distance lies on its circle."""
     along = rho * baseline
     return math.atan2(along * keep[SINE], 1.0 + along * math.cos(keep[PHI]))
 
 
-@compiled()
+@inlined()
 def _rho_by_angle(theta, baseline, keep):
     return keep[SINE] / (baseline * math.sin(max(keep[PHI] - theta, 1e-3)) ** 2)
 
 
-@compiled()
+@inlined()
 def _around(ray, T, epipole, step, keep, x, y, z):
     """Write the circles, and the directions of five samples of the reference along each."""
     for i in range(len(keep)):
@@ -64,7 +64,7 @@ def _around(ray, T, epipole, step, keep, x, y, z):
             z[5 * i + j] = ray[2, i] * cosine + f * sine
 
 
-@compiled()
+@inlined()
 def _lay_out(x, y, z, at, each, keep, cosine, sine):
     """Write the directions of a point's interval, one pixel of arc apart."""
     c, s = math.cos(keep[MIDDLE]), math.sin(keep[MIDDLE])
@@ -78,7 +78,7 @@ def _lay_out(x, y, z, at, each, keep, cosine, sine):
         z[at + j] = g * cosine[first + j] + f * sine[first + j]
 
 
-@compiled()
+@inlined()
 def _match(seen, samples, step, max_ssd, min_distinction, keep, ssd):
     """Return the angle of the best place of an interval, and whether it is clear."""
     width = int(keep[WIDTH])
@@ -109,7 +109,7 @@ def _match(seen, samples, step, max_ssd, min_distinction, keep, ssd):
     return theta, best < max_ssd and second > min_distinction * best
 
 
-@compiled()
+@inlined()
 def _plan(rho, variance, baseline, step, settings, keep, samples):
     """Write a point's interval; return whether gradient, baseline and uncertainty make a search worth while."""
     min_gradient, min_sine, max_half_width = settings[0], settings[1], settings[2]
@@ -131,7 +131,7 @@ def _plan(rho, variance, baseline, step, settings, keep, samples):
     return worth
 
 
-@compiled(nogil=True)
+@compiled()
 def search(
     ray, rho, variance, slope, T, affine, reference, target, step, settings, out_rho, out_variance, searched, found
 ):

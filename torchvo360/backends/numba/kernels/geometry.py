@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 
-from torchvo360.backends.numba.kernels.jit import FAST, compiled
+from torchvo360.backends.numba.kernels.jit import FAST, inlined
 from torchvo360.backends.numba.kernels.scratch import (
     HALF,
     HALF_PI,
@@ -27,7 +27,7 @@ from torchvo360.backends.numba.kernels.scratch import (
 )
 
 
-@compiled(fastmath=FAST)
+@inlined(fastmath=FAST)
 def arctan2(y, x):
     """Return atan2, to 3e-7.
 
@@ -51,7 +51,7 @@ def arctan2(y, x):
     return -p if y < ZERO else p
 
 
-@compiled(fastmath=FAST)
+@inlined(fastmath=FAST)
 def warp(s, n, x, y, z, rho, weight, T):
     """Move points: their rays in the target, times the ratio of ranges."""
     r00, r01, r02, t0 = f4(T[0, 0]), f4(T[0, 1]), f4(T[0, 2]), f4(T[0, 3])
@@ -66,7 +66,7 @@ def warp(s, n, x, y, z, rho, weight, T):
         s[WEIGHT + i] = weight[i]
 
 
-@compiled(fastmath=FAST)
+@inlined(fastmath=FAST)
 def project_sphere(s, n, fx, fy, cx, cy):
     """Find pixels of a panorama."""
     for i in range(n):
@@ -77,7 +77,7 @@ def project_sphere(s, n, fx, fy, cx, cy):
         s[V + i] = cy - arctan2(y, math.sqrt(horizontal2)) * fy
 
 
-@compiled()
+@inlined()
 def project_pinhole(s, n, fx, fy, cx, cy):
     """Find pixels of a pinhole."""
     # Rounded after every step, as elsewhere: at the identity the outermost pixels lie on the border of what is seen.
@@ -88,7 +88,7 @@ def project_pinhole(s, n, fx, fy, cx, cy):
         s[V + i] = s[Y + i] * inv_z * fy + cy
 
 
-@compiled(fastmath=FAST)
+@inlined(fastmath=FAST)
 def wrap(s, n, period):
     """Bring u into one turn."""
     inv_period = ONE / period
@@ -99,7 +99,7 @@ def wrap(s, n, period):
         s[U + i] = u - period if u >= period else u
 
 
-@compiled(fastmath=FAST)
+@inlined(fastmath=FAST)
 def hide_unseen(s, n, last_u, last_v, nearest):
     """Let points out of view weigh nothing and stand in as one ahead: behind a pinhole they would be of any size."""
     for i in range(n):
@@ -112,7 +112,7 @@ def hide_unseen(s, n, last_u, last_v, nearest):
         s[WEIGHT + i] = s[WEIGHT + i] if seen else ZERO
 
 
-@compiled(fastmath=FAST)
+@inlined(fastmath=FAST)
 def locate(s, index, n, height, width):
     """Turn points into rays and pixels into fractions of a cell and the cell's index."""
     last_u, last_v = f4(width + 0.5), f4(height + 0.5)

@@ -14,7 +14,7 @@ _STAMP = tuple((path.name, path.stat().st_mtime_ns, path.stat().st_size) for pat
 
 
 def compiled(**options: Any) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
-    """Compile a function by numba without its interpreter, and keep what was compiled on disk.
+    """Compile a function that Python calls, without Python's lock, and keep what was compiled on disk.
 
     By itself numba looks for changes in the file of the function alone. A kernel is made of functions of several files
     here: a change in any of them compiles all again.
@@ -24,8 +24,20 @@ def compiled(**options: Any) -> Callable[[Callable[..., Any]], Callable[..., Any
     """
 
     def decorate(function: Callable[..., Any]) -> Callable[..., Any]:
-        dispatcher = njit(error_model="numpy", cache=True, **options)(function)
-        dispatcher._cache._cache_file._source_stamp = _STAMP
+        dispatcher: Any = njit(error_model="numpy", cache=True, nogil=True, **options)(function)
+        dispatcher._cache._cache_file._source_stamp = _STAMP  # there is no public way
         return dispatcher
 
     return decorate
+
+
+def inlined(**options: Any) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
+    """Compile a part of kernels into each of them.
+
+    As a function of its own it would be compiled with every kernel that calls it, a little differently, and whichever
+    was loaded first would serve them all: sums would depend on what else the process has done before.
+
+    Args:
+        options: Of `numba.njit`, besides.
+    """
+    return njit(error_model="numpy", forceinline=True, **options)

@@ -8,14 +8,14 @@ handed out together. Either way a pair gets the same bits.
 import numpy as np
 from numba import get_num_threads, set_num_threads
 
-from torchvo360.backends.numba.kernels.jit import FAST, compiled
+from torchvo360.backends.numba.kernels.jit import FAST, compiled, inlined
 from torchvo360.backends.numba.kernels.pairs import PART, SUMS, element, sum_in_threads, sum_part
 from torchvo360.backends.numba.kernels.rigid import se3_log, times_inverse
 from torchvo360.backends.numba.kernels.scratch import BLOCK, SCRATCH, f4
 from torchvo360.backends.numba.kernels.steps import COST, EQUATIONS, SQUARE, WEIGHT, G, begin, find_candidate, judge
 
 
-@compiled(fastmath=FAST)
+@inlined(fastmath=FAST)
 def weigh_ranges(rho, weight):
     """Return the sums of weights, and of weights times inverse ranges."""
     total, near = 0.0, 0.0
@@ -26,7 +26,7 @@ def weigh_ranges(rho, weight):
     return total, near
 
 
-@compiled()
+@inlined()
 def find_scale(points, per_radian, scale):
     """Write each pair's factors from steps of (v, w, a, b) to comparable units: of v by the mean inverse range."""
     rho, weight = points[1], points[3]
@@ -40,7 +40,7 @@ def find_scale(points, per_radian, scale):
             scale[b, p] = by_v if p < 3 else (per_radian if p < 6 else 1.0)
 
 
-@compiled()
+@inlined()
 def add_up(sums, b, T, prior, row):
     """Write normal equations: the sums of a pair's parts in their order, and the prior's, to first order.
 
@@ -71,7 +71,7 @@ def add_up(sums, b, T, prior, row):
             row[COST] += 0.5 * d[p] * pull
 
 
-@compiled()
+@inlined()
 def go_on(b, first, sums, prior, state, candidate, scale, free, rules, outcomes):
     """Judge what has been evaluated, the start first of all; return whether a further candidate is to be evaluated."""
     add_up(sums, b, candidate[0][b], prior, candidate[2][b])
@@ -84,7 +84,7 @@ def go_on(b, first, sums, prior, state, candidate, scale, free, rules, outcomes)
     return going and find_candidate(b, state, candidate, scale, free, rules, outcomes)
 
 
-@compiled(nogil=True)
+@compiled()
 def _one_by_one(points, images, k, optics, loss, prior, per_radian, state, candidate, free, rules, outcomes):
     """Solve pair after pair."""
     T, affine = candidate[0], candidate[1]
@@ -102,7 +102,7 @@ def _one_by_one(points, images, k, optics, loss, prior, per_radian, state, candi
             first = False
 
 
-@compiled(nogil=True)
+@compiled()
 def _in_step(workers, points, images, k, optics, loss, prior, per_radian, state, candidate, free, rules, outcomes):
     """Evaluate all pairs that have not ended together, in threads, step by step."""
     T, affine = candidate[0], candidate[1]

@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 
-from torchvo360.backends.numba.kernels.jit import FAST, compiled
+from torchvo360.backends.numba.kernels.jit import FAST, inlined
 from torchvo360.backends.numba.kernels.scratch import (
     EACH,
     GAINED,
@@ -28,7 +28,7 @@ from torchvo360.backends.numba.kernels.scratch import (
 )
 
 
-@compiled(fastmath=FAST)
+@inlined(fastmath=FAST)
 def gather(s, index, n, image, pitch):
     """Fetch the four pixels about every place."""
     right, below = np.uintp(1), np.uintp(pitch)
@@ -40,7 +40,7 @@ def gather(s, index, n, image, pitch):
         s[T11 + i] = image[j + below + right]
 
 
-@compiled(fastmath=FAST)
+@inlined(fastmath=FAST)
 def doubt(s, n):
     """Weigh by the confidence that was gathered."""
     for i in range(n):
@@ -50,7 +50,7 @@ def doubt(s, n):
         s[WEIGHT + i] *= upper + s[V + i] * (lower - upper)
 
 
-@compiled(fastmath=FAST)
+@inlined(fastmath=FAST)
 def compare(s, n, kind, value, gain, offset, saturation, fx, fy, polar2):
     """Interpolate what was gathered: the residuals, and gradients as covectors."""
     for i in range(n):

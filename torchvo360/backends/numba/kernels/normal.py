@@ -5,13 +5,13 @@ import math
 import numpy as np
 
 from torchvo360.backends.numba.kernels.edges import relate
-from torchvo360.backends.numba.kernels.jit import FAST, compiled
+from torchvo360.backends.numba.kernels.jit import FAST, compiled, inlined
 
 CHUNK = 128
 """Points of one product: their rows fill part of a second cache, those of one tile little of a first."""
 
 
-@compiled(nogil=True)
+@compiled()
 def assemble(M, T_first, affine):
     """Bring the sums of all edges to the keyframes' unknowns.
 
@@ -66,7 +66,7 @@ def assemble(M, T_first, affine):
     return H, g
 
 
-@compiled(fastmath=FAST)
+@inlined(fastmath=FAST)
 def add_tile(rows, p, q, n, A):
     """Add the products of four rows with four others, in registers."""
     a0, a1, a2, a3 = rows[p], rows[p + 1], rows[p + 2], rows[p + 3]
@@ -110,7 +110,7 @@ def add_tile(rows, p, q, n, A):
     A[p + 3, q + 3] += m33
 
 
-@compiled(fastmath=FAST)
+@inlined(fastmath=FAST)
 def scale_rows(cross, root, rows, first, n):
     """Copy some points of all rows, scaled."""
     for p in range(len(cross)):
@@ -121,7 +121,7 @@ def scale_rows(cross, root, rows, first, n):
             row[i] = 0.0
 
 
-@compiled(fastmath=FAST)
+@inlined(fastmath=FAST)
 def dot(x, y, n):
     """Return the sum of products."""
     total = 0.0
@@ -130,7 +130,7 @@ def dot(x, y, n):
     return total
 
 
-@compiled(nogil=True)
+@compiled()
 def eliminate_points(cross, diagonal, slope):
     """Sum what the elimination of the points takes from the keyframes' equations.
 
@@ -162,7 +162,7 @@ def eliminate_points(cross, diagonal, slope):
     return A, b
 
 
-@compiled(nogil=True, fastmath=FAST)
+@compiled(fastmath=FAST)
 def step_points(x, cross, diagonal, slope):
     """Return the points' steps, -(slope + x . cross) / diagonal."""
     D, N = cross.shape

@@ -13,7 +13,7 @@ import torch
 from numba import get_num_threads, prange, set_num_threads
 
 from torchvo360.backends.numba.kernels.geometry import hide_unseen, locate, project_pinhole, project_sphere, warp, wrap
-from torchvo360.backends.numba.kernels.jit import compiled
+from torchvo360.backends.numba.kernels.jit import compiled, inlined
 from torchvo360.backends.numba.kernels.lookup import compare, doubt, gather
 from torchvo360.backends.numba.kernels.rows import add_products, add_slopes, build_rows
 from torchvo360.backends.numba.kernels.scratch import BLOCK, NEAREST, PI, PINHOLE, SCRATCH, SPHERE, TWO, f4
@@ -26,13 +26,13 @@ SUMS = 47
 """The upper triangle of the 9 x 9 matrix row by row, the cost and the weight."""
 
 
-@compiled()
+@inlined()
 def element(array, b):
     """Return the b-th of a batch, or the one that all share."""
     return array[b if array.shape[0] > 1 else 0]
 
 
-@compiled()
+@inlined()
 def place_block(s, index, at, end, ray, rho, weight, images, b, T, k, optics):
     """Warp the points from at to end, find their cells, and weigh them by what the image is sure of there."""
     padded, confidence = images
@@ -55,7 +55,7 @@ def place_block(s, index, at, end, ray, rho, weight, images, b, T, k, optics):
         doubt(s, n)
 
 
-@compiled()
+@inlined()
 def sum_part(s, index, b, first, last, points, images, T, affine, k, optics, loss, sums):
     """Sum the points from first to last of pair b."""
     ray, rho, value, weight, variance = points
@@ -91,7 +91,7 @@ def sum_part(s, index, b, first, last, points, images, T, affine, k, optics, los
     sums[45], sums[46] = total_cost, total_weight
 
 
-@compiled(nogil=True)
+@compiled()
 def _sum_parts(worker, workers, parts, places, points, images, T, affine, k, optics, loss, sums):
     """Sum every so many of some pairs' parts, in one scratch array: newly given memory costs at every page."""
     s, index = np.empty(SCRATCH, f4), np.empty(BLOCK, np.uint32)
@@ -101,7 +101,7 @@ def _sum_parts(worker, workers, parts, places, points, images, T, affine, k, opt
         sum_part(s, index, b, first, min(first + PART, N), points, images, T, affine, k, optics, loss, sums[task])
 
 
-@compiled(nogil=True, parallel=True)
+@compiled(parallel=True)
 def sum_in_threads(workers, parts, places, points, images, T, affine, k, optics, loss, sums):
     """Sum the parts of the pairs at some places of a batch, one pair's after the other's."""
     # Nothing else here: numba hands an innocent np.zeros out to all threads, and waits for them.

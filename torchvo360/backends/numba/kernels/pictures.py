@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 
-from torchvo360.backends.numba.kernels.jit import FAST, compiled
+from torchvo360.backends.numba.kernels.jit import FAST, compiled, inlined
 from torchvo360.backends.numba.kernels.scratch import HALF, f4
 
 QUARTER, STEP = f4(0.25), f4(1 / 255)
@@ -12,7 +12,7 @@ INFINITE = np.int32(0x7F800000)
 """The bits of infinity."""
 
 
-@compiled(fastmath=FAST)
+@inlined(fastmath=FAST)
 def _scale(row, margin, wraps, wide):
     """Write a row of 8 bits in [0, 1], with its margins."""
     W = len(row)
@@ -23,7 +23,7 @@ def _scale(row, margin, wraps, wide):
         wide[margin + W + c] = wide[margin + c] if wraps else wide[margin + W - 1]
 
 
-@compiled(fastmath=FAST)
+@inlined(fastmath=FAST)
 def _weigh(wide, taps, out):
     for c in range(len(out)):
         out[c] = taps[0] * wide[c]
@@ -33,7 +33,7 @@ def _weigh(wide, taps, out):
             out[c] += tap * wide[c + k]
 
 
-@compiled(fastmath=FAST)
+@inlined(fastmath=FAST)
 def _combine(lines, first, taps, out):
     """Write the weighted sum of lines, which begin with one of them and go around, into a padded row."""
     for c in range(lines.shape[1]):
@@ -44,7 +44,7 @@ def _combine(lines, first, taps, out):
             out[c + 1] += tap * line[c]
 
 
-@compiled()
+@inlined()
 def _turn(row, by, out):
     for c in range(by):
         out[c] = row[c + len(row) - by]
@@ -52,7 +52,7 @@ def _turn(row, by, out):
         out[c] = row[c - by]
 
 
-@compiled(nogil=True)
+@compiled()
 def smooth(grey, taps, wraps, padded):
     """Smooth an image around the seam and over the poles, or with its edges repeated; borders are left to `edge`.
 
@@ -82,7 +82,7 @@ def smooth(grey, taps, wraps, padded):
             _combine(lines, row % size, taps, padded[row + 1])
 
 
-@compiled(nogil=True)
+@compiled()
 def edge(padded, wraps):
     """Fill the border of one pixel from the image within, as `image.pad_image` does."""
     H, W = padded.shape[0] - 2, padded.shape[1] - 2
@@ -95,7 +95,7 @@ def edge(padded, wraps):
         padded[r, W + 1] = padded[r, 1 if wraps else W]
 
 
-@compiled(nogil=True, fastmath=FAST)
+@compiled(fastmath=FAST)
 def halve(fine, padded):
     """Write the means of two by two pixels of a padded image into one of half the size; its border is left."""
     for r in range(padded.shape[0] - 2):
@@ -104,7 +104,7 @@ def halve(fine, padded):
             out[c + 1] = (upper[2 * c + 1] + upper[2 * c + 2] + lower[2 * c + 1] + lower[2 * c + 2]) * QUARTER
 
 
-@compiled(nogil=True, fastmath=FAST)
+@compiled(fastmath=FAST)
 def gradient_strength(padded, by_u, by_v, x, y, strength):
     """Measure the gradient by central differences: `sqrt(by_u g_u^2 + by_v g_v^2 + (x g_u + y g_v)^2)`.
 
@@ -126,7 +126,7 @@ def gradient_strength(padded, by_u, by_v, x, y, strength):
             out[c] = math.sqrt(p * g_u * g_u + q * g_v * g_v + radial * radial)
 
 
-@compiled()
+@inlined()
 def _rank(strength, usable, minimum, rank):
     """Write numbers in the order of the strengths: their bits, which compare faster; -1 where none is to be chosen."""
     for c in range(len(rank)):
@@ -135,7 +135,7 @@ def _rank(strength, usable, minimum, rank):
         rank[c] = rank[c] if (rank[c] >= minimum) & (rank[c] <= INFINITE) else np.int32(-1)  # a NaN is beyond
 
 
-@compiled(nogil=True)
+@compiled()
 def strongest(strength, usable, minimum, first, cells, most, pixel):
     """Find the strongest usable pixel of each cell, of equals the first.
 

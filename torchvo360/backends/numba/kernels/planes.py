@@ -6,7 +6,7 @@ compile several times faster than views of rows.
 
 import numpy as np
 
-from torchvo360.backends.numba.kernels.jit import FAST, compiled
+from torchvo360.backends.numba.kernels.jit import FAST, compiled, inlined
 from torchvo360.backends.numba.kernels.scratch import ONE, ZERO, f4
 
 QUARTER = f4(0.25)
@@ -14,7 +14,7 @@ QUARTER = f4(0.25)
 u = np.uintp  # where an index might be negative, numba asks at every access, and no vector code comes of it
 
 
-@compiled(fastmath=FAST)
+@inlined(fastmath=FAST)
 def scale(into, at, source, first, n, factor):
     """Write part of a row times a factor."""
     at, first = u(at), u(first)
@@ -22,7 +22,7 @@ def scale(into, at, source, first, n, factor):
         into[at + x] = factor * source[first + x]
 
 
-@compiled(fastmath=FAST)
+@inlined(fastmath=FAST)
 def add(into, at, source, first, n, factor):
     """Add part of a row times a factor."""
     at, first = u(at), u(first)
@@ -30,7 +30,7 @@ def add(into, at, source, first, n, factor):
         into[at + x] += factor * source[first + x]
 
 
-@compiled(fastmath=FAST)
+@inlined(fastmath=FAST)
 def convolve_five(into, at, source, first, pitch, n, t0, t1, t2, t3, t4):
     """Write a weighted sum of five rows, or of one row at five places."""
     at, a, b, c = u(at), u(first), u(first + pitch), u(first + 2 * pitch)
@@ -41,7 +41,7 @@ def convolve_five(into, at, source, first, pitch, n, t0, t1, t2, t3, t4):
         )
 
 
-@compiled()
+@inlined()
 def convolve(into, at, source, first, pitch, n, taps):
     """Write a weighted sum of rows, or of one row at several places."""
     if len(taps) == 5:
@@ -52,7 +52,7 @@ def convolve(into, at, source, first, pitch, n, taps):
         add(into, at, source, first + j * pitch, n, taps[j])
 
 
-@compiled()
+@inlined()
 def extend(row, at, margin, W, wraps):
     """Fill both ends of a row whose middle is there."""
     middle, end = at + margin, at + margin + W
@@ -61,7 +61,7 @@ def extend(row, at, margin, W, wraps):
         row[end + x] = row[middle + x] if wraps else row[end - 1]
 
 
-@compiled()
+@inlined()
 def add_beyond(row, radius, plane, at, y, H, W, factor, wraps):
     """Add the row that stands at y, above or below the image."""
     if wraps:
@@ -72,7 +72,7 @@ def add_beyond(row, radius, plane, at, y, H, W, factor, wraps):
         add(row, radius, plane, at + W * (0 if y < 0 else H - 1), W, factor)
 
 
-@compiled(nogil=True)
+@compiled()
 def blur_planes(planes, shape, taps, wraps, out):
     """Convolve planes with taps along both axes, around the seam and over the poles."""
     P, H, W = shape
@@ -95,7 +95,7 @@ def blur_planes(planes, shape, taps, wraps, out):
             convolve(out, at + W * y, row, 0, 1, W, taps)
 
 
-@compiled(fastmath=FAST)
+@inlined(fastmath=FAST)
 def halve(source, first, W, into, at, n):
     """Write the means of squares of 2 x 2 pixels."""
     at, upper, lower = u(at), u(first), u(first + W)
@@ -106,7 +106,7 @@ def halve(source, first, W, into, at, n):
         ) * QUARTER
 
 
-@compiled()
+@inlined()
 def shrink(source, first, W, rows, into, at, n):
     """Write the means over the whole pixels of some rows that each new pixel of a row touches."""
     for x in range(n):
@@ -118,7 +118,7 @@ def shrink(source, first, W, rows, into, at, n):
         into[at + x] = total / f4(rows * (right - left))
 
 
-@compiled(nogil=True)
+@compiled()
 def shrink_levels(levels, P, sizes):
     """Fill all levels but the first, each from the one before by means.
 
@@ -144,7 +144,7 @@ def shrink_levels(levels, P, sizes):
         before = after
 
 
-@compiled(nogil=True)
+@compiled()
 def pad_levels(levels, first, P, Q, sizes, wraps, out):
     """Extend planes of all levels by one pixel on each side.
 

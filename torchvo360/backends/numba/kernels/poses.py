@@ -6,7 +6,7 @@ from torchvo360.backends.numba.kernels.jit import compiled
 from torchvo360.backends.numba.kernels.rigid import multiply, se3_exp, se3_log, times_inverse
 
 
-@compiled(nogil=True)
+@compiled()
 def move_poses(T, xi):
     """Return `exp(xi) T` of poses [K, 4, 4] and tangents (v, w) [K, 6]."""
     moved = np.empty_like(T)
@@ -15,7 +15,7 @@ def move_poses(T, xi):
     return moved
 
 
-@compiled(nogil=True)
+@compiled()
 def steps_between(T, T_first):
     """Return the tangents `log(T T_first^-1)` [K, 6] of poses [K, 4, 4]."""
     xi = np.empty((len(T), 6))

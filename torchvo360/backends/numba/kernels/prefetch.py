@@ -8,7 +8,7 @@ from numba import types
 from numba.core import cgutils
 from numba.extending import intrinsic
 
-from torchvo360.backends.numba.kernels.jit import compiled
+from torchvo360.backends.numba.kernels.jit import inlined
 
 READ, KEEP, DATA = 0, 3, 1
 """As LLVM's `prefetch` takes them: to read, in all caches, not as instructions."""
@@ -32,7 +32,7 @@ def _fetch(typing_context: Any, array: Any, index: Any) -> Any:
 fetch: Any = intrinsic(_fetch)
 
 
-@compiled()
+@inlined()
 def fetch_cells(index, n, image, pitch):
     """Ask for the pixels that `lookup.gather` reads: both rows of every cell."""
     below = np.uintp(pitch)

@@ -5,7 +5,7 @@ import math
 import numpy as np
 
 from torchvo360.backends.numba.kernels.geometry import project_pinhole, project_sphere, wrap
-from torchvo360.backends.numba.kernels.jit import compiled
+from torchvo360.backends.numba.kernels.jit import compiled, inlined
 from torchvo360.backends.numba.kernels.scratch import BLOCK, NEAREST, ONE, SPHERE, U, V, X, Y, Z, f4
 from torchvo360.backends.numba.kernels.sight import desk, see
 from torchvo360.cameras.equirectangular import MIN_HORIZONTAL
@@ -13,7 +13,7 @@ from torchvo360.cameras.equirectangular import MIN_HORIZONTAL
 NEAREST_AXIS2 = f4(MIN_HORIZONTAL**2)
 
 
-@compiled()
+@inlined()
 def _carry(ray, centre, rho, host, T, out_ray, out_rho):
     """Move points into the keyframe."""
     for i in range(len(rho)):
@@ -26,7 +26,7 @@ def _carry(ray, centre, rho, host, T, out_ray, out_rho):
         out_ray[0, i], out_ray[1, i], out_ray[2, i], out_rho[i] = x * inverse, y * inverse, z * inverse, d * inverse
 
 
-@compiled()
+@inlined()
 def _find(s, ray, view, pixel, shown):
     """Write the nearest pixels, and which rays are in view."""
     image, _, k, kind, period, _, may_miss, _ = view
@@ -51,7 +51,7 @@ def _find(s, ray, view, pixel, shown):
             pixel[at + i], shown[at + i] = row * width + column, seen
 
 
-@compiled(nogil=True)
+@compiled()
 def project(ray, centre, rho, host, value, weight, T, affine, own, view, most, out_ray, out_rho, pixel, shown):
     """Find where points lie in a keyframe, and whether they look there as they should.
 

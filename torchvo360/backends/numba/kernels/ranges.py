@@ -3,14 +3,14 @@
 What is known is a share: 1 or 0 at first, and the known part of a pixel's area at smaller levels.
 """
 
-from torchvo360.backends.numba.kernels.jit import FAST, compiled
+from torchvo360.backends.numba.kernels.jit import FAST, compiled, inlined
 from torchvo360.backends.numba.kernels.planes import u
 from torchvo360.backends.numba.kernels.scratch import HALF, ONE, ZERO, f4
 
 LEAST_SHARE = f4(1e-6)
 
 
-@compiled(fastmath=FAST)
+@inlined(fastmath=FAST)
 def bound(values, first, shares, at, n, most):
     """Let nothing be known where a value is negative, too large or NaN."""
     first, at = u(first), u(at)
@@ -19,7 +19,7 @@ def bound(values, first, shares, at, n, most):
         shares[at + i] = shares[at + i] if (value >= ZERO) & (value <= most) else ZERO
 
 
-@compiled(fastmath=FAST)
+@inlined(fastmath=FAST)
 def keep_below(values, first, shares, at, n, limit):
     """Let nothing be known where a value reaches a limit."""
     first, at = u(first), u(at)
@@ -27,7 +27,7 @@ def keep_below(values, first, shares, at, n, limit):
         shares[at + i] = shares[at + i] if values[first + i] < limit else ZERO
 
 
-@compiled(fastmath=FAST)
+@inlined(fastmath=FAST)
 def allow(allowed, first, shares, at, n):
     """Let nothing be known where it is not allowed."""
     first, at = u(first), u(at)
@@ -35,7 +35,7 @@ def allow(allowed, first, shares, at, n):
         shares[at + i] = shares[at + i] if allowed[first + i] else ZERO
 
 
-@compiled(fastmath=FAST)
+@inlined(fastmath=FAST)
 def copy_known(values, first, shares, share, into, at, n):
     """Write values where they are known, else zeros."""
     first, share, at = u(first), u(share), u(at)
@@ -43,7 +43,7 @@ def copy_known(values, first, shares, share, into, at, n):
         into[at + i] = values[first + i] if shares[share + i] > ZERO else ZERO
 
 
-@compiled(nogil=True)
+@compiled()
 def open_ranges(rho, variance, allowed, usable, image, limits, levels):
     """Write inverse ranges, their variances where there are some, and 1 or 0 for what is known: the finest level.
 
@@ -74,7 +74,7 @@ def open_ranges(rho, variance, allowed, usable, image, limits, levels):
             copy_known(variance, first, levels, at, levels, total + first, N)
 
 
-@compiled(fastmath=FAST)
+@inlined(fastmath=FAST)
 def divide(levels, at, share, n):
     """Turn sums over what is known into means."""
     at, share = u(at), u(share)
@@ -82,7 +82,7 @@ def divide(levels, at, share, n):
         levels[at + i] /= max(levels[share + i], LEAST_SHARE)
 
 
-@compiled(fastmath=FAST)
+@inlined(fastmath=FAST)
 def weigh(levels, share, n, areas, area):
     """Turn shares into weights: a pixel's area where at least half of it is known."""
     share, area = u(share), u(area)
@@ -90,7 +90,7 @@ def weigh(levels, share, n, areas, area):
         levels[share + i] = areas[area + i] if levels[share + i] >= HALF else ZERO
 
 
-@compiled(nogil=True)
+@compiled()
 def close_ranges(levels, values, B, sizes, areas):
     """Turn sums and shares of every level into means and weights.
 

@@ -4,13 +4,13 @@ import math
 
 import numpy as np
 
-from torchvo360.backends.numba.kernels.jit import compiled
+from torchvo360.backends.numba.kernels.jit import inlined
 
 SMALL = 0.25
 """Below this squared angle series are used: their first dropped term is below the rounding of float64."""
 
 
-@compiled()
+@inlined()
 def rodrigues(angle2):
     """Return sin(t)/t, (1 - cos t)/t^2 and (t - sin t)/t^3 of a squared angle t^2."""
     if angle2 >= SMALL:
@@ -26,7 +26,7 @@ def rodrigues(angle2):
     return a, 0.5 * b, c / 6.0
 
 
-@compiled()
+@inlined()
 def identity():
     """Return the identity [4, 4]."""
     M = np.empty((4, 4))
@@ -36,7 +36,7 @@ def identity():
     return M
 
 
-@compiled()
+@inlined()
 def add_skew(w, skew, square, M):
     """Add `skew * hat(w) + square * hat(w)^2` to the upper left 3 x 3 of M."""
     x, y, z = w[0], w[1], w[2]
@@ -51,7 +51,7 @@ def add_skew(w, skew, square, M):
     M[2, 1] += square * y * z + skew * x
 
 
-@compiled()
+@inlined()
 def se3_exp(xi):
     """Return the rigid motion [4, 4] of a tangent (v, w)."""
     w = xi[3:6]
@@ -64,7 +64,7 @@ def se3_exp(xi):
     return T
 
 
-@compiled()
+@inlined()
 def so3_log(R, w):
     """Write the rotation vector of R, of length at most pi."""
     # Of Shepperd's four solutions the one with the largest divisor.
@@ -88,7 +88,7 @@ def so3_log(R, w):
         w[i] = factor * q[i]
 
 
-@compiled()
+@inlined()
 def se3_log(T):
     """Return the tangent (v, w) of a rigid motion."""
     xi = np.empty(6)
@@ -107,7 +107,7 @@ def se3_log(T):
     return xi
 
 
-@compiled()
+@inlined()
 def multiply(A, B, out):
     """Write the product of two rigid motions."""
     for i in range(4):
@@ -115,7 +115,7 @@ def multiply(A, B, out):
             out[i, j] = A[i, 0] * B[0, j] + A[i, 1] * B[1, j] + A[i, 2] * B[2, j] + A[i, 3] * B[3, j]
 
 
-@compiled()
+@inlined()
 def times_inverse(A, B):
     """Return `A B^-1` of rigid motions."""
     inverse, out = identity(), np.empty((4, 4))

@@ -2,7 +2,7 @@
 
 import math
 
-from torchvo360.backends.numba.kernels.jit import FAST, compiled
+from torchvo360.backends.numba.kernels.jit import FAST, inlined
 from torchvo360.backends.numba.kernels.scratch import (
     BLOCK,
     COST,
@@ -33,7 +33,7 @@ from torchvo360.backends.numba.kernels.scratch import (
 )
 
 
-@compiled(fastmath=FAST)
+@inlined(fastmath=FAST)
 def build_rows(s, n):
     """Write weighted rows; return the cost and the weight."""
     cost, weight = ZERO, ZERO
@@ -56,7 +56,7 @@ def build_rows(s, n):
     return cost, weight
 
 
-@compiled(fastmath=FAST)
+@inlined(fastmath=FAST)
 def add_slopes(s, n, T):
     """Add what the range weight's slope adds to the rows."""
     t0, t1, t2 = f4(T[0, 3]), f4(T[1, 3]), f4(T[2, 3])
@@ -71,7 +71,7 @@ def add_slopes(s, n, T):
         s[S5 + i] += t0 * gy - t1 * gx
 
 
-@compiled(fastmath=FAST)
+@inlined(fastmath=FAST)
 def add_products(s, n, M):
     """Add `S S^T` in tiles of 3 x 3, whose sums stay in registers."""
     for p in range(0, 9, 3):

@@ -4,13 +4,13 @@ import math
 
 import numpy as np
 
-from torchvo360.backends.numba.kernels.jit import FAST, compiled
+from torchvo360.backends.numba.kernels.jit import FAST, compiled, inlined
 from torchvo360.backends.numba.kernels.lookup import compare, gather
 from torchvo360.backends.numba.kernels.pairs import element, place_block
 from torchvo360.backends.numba.kernels.scratch import BLOCK, EACH, GAINED, GX, GY, GZ, RESIDUAL, SCRATCH, f4
 
 
-@compiled(fastmath=FAST)
+@inlined(fastmath=FAST)
 def keep(s, n, scale, residual, value, weight, slope2):
     """Write out a block's samples."""
     for i in range(n):
@@ -21,7 +21,7 @@ def keep(s, n, scale, residual, value, weight, slope2):
         slope2[i] = (gx * gx + gy * gy + gz * gz) * scale
 
 
-@compiled()
+@inlined()
 def sample_pair(s, index, b, points, images, T, affine, k, optics, saturation, scale, out):
     """Write residuals, values, weights and squared gradients of all samples of pair b, [4, C, N]."""
     kind, _, _, polar2 = optics
@@ -39,7 +39,7 @@ def sample_pair(s, index, b, points, images, T, affine, k, optics, saturation, s
             keep(s, n, scale, out[0, c, at:end], out[1, c, at:end], out[2, c, at:end], out[3, c, at:end])
 
 
-@compiled(nogil=True)
+@compiled()
 def sample_pairs(points, images, T, affine, k, optics, saturation, scale, out):
     """Write residuals, values, weights and squared gradients of all samples.
 

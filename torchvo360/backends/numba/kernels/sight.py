@@ -3,7 +3,7 @@
 import numpy as np
 
 from torchvo360.backends.numba.kernels.geometry import hide_unseen, locate, project_pinhole, project_sphere, wrap
-from torchvo360.backends.numba.kernels.jit import FAST, compiled
+from torchvo360.backends.numba.kernels.jit import FAST, compiled, inlined
 from torchvo360.backends.numba.kernels.lookup import doubt, gather
 from torchvo360.backends.numba.kernels.scratch import (
     BLOCK,
@@ -30,13 +30,13 @@ SURE = f4(MIN_CONFIDENCE)
 NAN = f4(np.nan)
 
 
-@compiled()
+@inlined()
 def desk():
     """Return the scratch of a block and its indices; filled, since numbers below the normal ones are slow to touch."""
     return np.zeros(SCRATCH, f4), np.zeros(BLOCK, np.uint32)
 
 
-@compiled(fastmath=FAST)
+@inlined(fastmath=FAST)
 def _lay(s, n, x, y, z):
     for i in range(n):
         s[X + i] = x[i]
@@ -45,7 +45,7 @@ def _lay(s, n, x, y, z):
         s[WEIGHT + i] = ONE
 
 
-@compiled(fastmath=FAST)
+@inlined(fastmath=FAST)
 def _read(s, n, saturation, out):
     for i in range(n):
         across = s[U + i]
@@ -56,7 +56,7 @@ def _read(s, n, saturation, out):
         out[i] = value if usable else NAN
 
 
-@compiled()
+@inlined()
 def see(s, index, x, y, z, n, view, out):
     """Look an image up along the first n rays; NaN where they are unseen, masked or clipped.
 
@@ -97,7 +97,7 @@ def see(s, index, x, y, z, n, view, out):
         _read(s, m, saturation, out[at:end])
 
 
-@compiled(nogil=True)
+@compiled()
 def see_rays(ray, view, out):
     """Look an image up along rays [3, N]."""
     s, index = desk()

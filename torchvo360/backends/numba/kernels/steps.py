@@ -7,7 +7,7 @@ import math
 
 import numpy as np
 
-from torchvo360.backends.numba.kernels.jit import compiled
+from torchvo360.backends.numba.kernels.jit import inlined
 from torchvo360.backends.numba.kernels.rigid import multiply, se3_exp
 from torchvo360.backends.numba.kernels.symmetric import solve_ldl
 
@@ -19,7 +19,7 @@ EQUATIONS = 75
 TO_JUDGE, UNSOLVABLE, ARRIVED = 0, 1, 2
 
 
-@compiled()
+@inlined()
 def begin(b, state, rules, outcomes):
     """Judge a pair's start; return whether it goes on."""
     _, _, equations, damping, status, steps = state
@@ -34,7 +34,7 @@ def begin(b, state, rules, outcomes):
     return status[b] == going_on
 
 
-@compiled()
+@inlined()
 def copy_motion(T, affine, T_out, affine_out):
     """Copy a pose and brightness, by loops: numba compiles assignments of whole arrays for seconds."""
     for i in range(4):
@@ -43,7 +43,7 @@ def copy_motion(T, affine, T_out, affine_out):
     affine_out[0], affine_out[1] = affine[0], affine[1]
 
 
-@compiled()
+@inlined()
 def retract(T, affine, delta, T_new, affine_new, farthest, most_gain):
     """Apply a step (v, w, a, b) to a pose and brightness; write them as they were where it leads nowhere sensible."""
     multiply(se3_exp(delta[:6]), T, T_new)
@@ -57,7 +57,7 @@ def retract(T, affine, delta, T_new, affine_new, farthest, most_gain):
         copy_motion(T, affine, T_new, affine_new)
 
 
-@compiled()
+@inlined()
 def propose(b, state, candidate, scale, free, rules):
     """Take the damped Gauss-Newton step of a pair; return TO_JUDGE, UNSOLVABLE or ARRIVED."""
     T, affine, equations, damping, _, steps = state
@@ -80,7 +80,7 @@ def propose(b, state, candidate, scale, free, rules):
     return ARRIVED if math.sqrt(length2) < step_tolerance and damping[b, 0] <= 1.0 else TO_JUDGE
 
 
-@compiled()
+@inlined()
 def promised_fall(row, delta, free):
     """Return by how much the linear model said the mean cost would fall."""
     fall = 0.0
@@ -92,7 +92,7 @@ def promised_fall(row, delta, free):
     return fall / row[WEIGHT]
 
 
-@compiled()
+@inlined()
 def next_damping(value, growth, accepted, gain, by_gain):
     """Return the damping and its growth after a step, by Nielsen's rule or by LSD-SLAM's."""
     if not accepted:
@@ -103,7 +103,7 @@ def next_damping(value, growth, accepted, gain, by_gain):
     return 0.0 if value <= 0.2 else value / 2.0, 2.0
 
 
-@compiled()
+@inlined()
 def judge(b, solvable, state, candidate, free, rules, outcomes):
     """Accept or refuse a pair's step, of which a solvable one has been evaluated; return whether the pair goes on."""
     T, affine, equations, damping, status, steps = state
@@ -138,7 +138,7 @@ def judge(b, solvable, state, candidate, free, rules, outcomes):
     return outcome == going_on
 
 
-@compiled()
+@inlined()
 def find_candidate(b, state, candidate, scale, free, rules, outcomes):
     """Propose steps of a pair until one is to be evaluated; return False where the pair has ended before."""
     while True:

@@ -5,12 +5,12 @@ The samples of one pair at a time are kept. Sums are float64, those of a block f
 
 import numpy as np
 
-from torchvo360.backends.numba.kernels.jit import FAST, compiled
+from torchvo360.backends.numba.kernels.jit import FAST, compiled, inlined
 from torchvo360.backends.numba.kernels.samples import sample_pair
 from torchvo360.backends.numba.kernels.scratch import BLOCK, SCRATCH, ZERO, f4
 
 
-@compiled(fastmath=FAST)
+@inlined(fastmath=FAST)
 def sum_values(value, weight):
     """Return the sums of weights, and of weights times values."""
     total, weighted = ZERO, ZERO
@@ -20,7 +20,7 @@ def sum_values(value, weight):
     return total, weighted
 
 
-@compiled(fastmath=FAST)
+@inlined(fastmath=FAST)
 def sum_energy(residual, value, weight, slope2, mean, tolerance2):
     """Return the gradient's energy, and that of where residuals, and where values less their mean, are explained."""
     energy, explained, by_chance = ZERO, ZERO, ZERO
@@ -33,7 +33,7 @@ def sum_energy(residual, value, weight, slope2, mean, tolerance2):
     return energy, explained, by_chance
 
 
-@compiled(nogil=True)
+@compiled()
 def explain_pairs(points, images, T, affine, k, optics, saturation, scale, tolerance2, sums):
     """Add up each pair's gradient energy, what of it the reference explains, and what each channel's mean would.
 
@@ -68,7 +68,7 @@ def explain_pairs(points, images, T, affine, k, optics, saturation, scale, toler
                     sums[b, m] += each[m]
 
 
-@compiled(nogil=True)
+@compiled()
 def measure_pairs(points, images, T, affine, k, optics, saturation, scale, moments):
     """Write mean and variance of each pair's target and reference, where both are seen, over channels' means.
 

@@ -4,12 +4,12 @@ import math
 
 import numpy as np
 
-from torchvo360.backends.numba.kernels.jit import compiled
+from torchvo360.backends.numba.kernels.jit import inlined
 
 LEAST = np.finfo(np.float64).tiny
 
 
-@compiled()
+@inlined()
 def solve_ldl(A, x, tolerance):
     """Solve by LDL^T of the matrix scaled to a unit diagonal, without pivoting, which needs none where it succeeds.
 

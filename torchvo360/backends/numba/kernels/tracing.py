@@ -8,14 +8,14 @@ import math
 
 import numpy as np
 
-from torchvo360.backends.numba.kernels.jit import FAST, compiled
+from torchvo360.backends.numba.kernels.jit import FAST, compiled, inlined
 from torchvo360.backends.numba.kernels.scratch import ONE, ZERO, f4
 from torchvo360.backends.numba.kernels.sight import desk, see
 
 SAMPLES = 5
 
 
-@compiled(fastmath=FAST)
+@inlined(fastmath=FAST)
 def _along(x, y, z, n, start, towards, i, cosine, sine):
     """Write the first n directions of a curve."""
     a, b, c = start[0, i], start[1, i], start[2, i]
@@ -26,7 +26,7 @@ def _along(x, y, z, n, start, towards, i, cosine, sine):
         z[j] = c * cosine[j] + f * sine[j]
 
 
-@compiled(fastmath=FAST)
+@inlined(fastmath=FAST)
 def _compare(seen, samples, i, n, most, never, ssd):
     """Write the sums of five squared differences at n places, from the second number on."""
     a, b, c, d, e = samples[i, 0], samples[i, 1], samples[i, 2], samples[i, 3], samples[i, 4]
@@ -48,7 +48,7 @@ def _compare(seen, samples, i, n, most, never, ssd):
         ssd[j + 1] = total if total < never else never
 
 
-@compiled(fastmath=FAST)
+@inlined(fastmath=FAST)
 def _valleys(ssd, n, never, valley):
     """Write the n sums again where they are lower than around; of a level stretch only the first: it is one place."""
     for j in range(n):
@@ -57,7 +57,7 @@ def _valleys(ssd, n, never, valley):
         valley[j] = here if lowest else never
 
 
-@compiled()
+@inlined()
 def _reach(theta, limit):
     """Return how many places, the third angle the first of them, lie nearer than a limit."""
     most = len(theta) - SAMPLES + 1
@@ -69,7 +69,7 @@ def _reach(theta, limit):
     return n
 
 
-@compiled(nogil=True)
+@compiled()
 def walk(start, towards, limit, samples, theta, cosine, sine, view, most, never, place, value):
     """Find the lowest valleys along each curve.
 
@@ -114,7 +114,7 @@ def walk(start, towards, limit, samples, theta, cosine, sine, view, most, never,
                 place[i, c], value[i, c] = f4(j), here
 
 
-@compiled(fastmath=FAST)
+@inlined(fastmath=FAST)
 def _place_pattern(x, y, z, ray, i, rho, T):
     """Write a point's pattern at all its inverse distances as rays in a view."""
     M, P = rho.shape[1], ray.shape[2]
@@ -131,7 +131,7 @@ def _place_pattern(x, y, z, ray, i, rho, T):
             z[at + m] = w + rho[i, m] * t2
 
 
-@compiled(fastmath=FAST)
+@inlined(fastmath=FAST)
 def _add_squares(seen, at, M, expected, weight, most, square, total):
     """Add one pixel of the pattern at all places."""
     for m in range(M):
@@ -142,7 +142,7 @@ def _add_squares(seen, at, M, expected, weight, most, square, total):
         total[m] += weight if known else ZERO
 
 
-@compiled(nogil=True)
+@compiled()
 def compare_patterns(ray, reference, weight, rho, T, gain, offset, view, most, worst, sees):
     """Compare whole patterns in one view, and keep the mean square differences of the view that fits worst.
 

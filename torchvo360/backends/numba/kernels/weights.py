@@ -2,7 +2,7 @@
 
 import math
 
-from torchvo360.backends.numba.kernels.jit import FAST, compiled
+from torchvo360.backends.numba.kernels.jit import FAST, inlined
 from torchvo360.backends.numba.kernels.scratch import (
     COST,
     FORCE,
@@ -23,7 +23,7 @@ from torchvo360.backends.numba.kernels.scratch import (
 )
 
 
-@compiled(fastmath=FAST)
+@inlined(fastmath=FAST)
 def shrink(s, n, variance, T, noise):
     """Find the root of the range weight, `depth_variance_weight`, and its slope."""
     t0, t1, t2 = f4(T[0, 3]), f4(T[1, 3]), f4(T[2, 3])
@@ -36,7 +36,7 @@ def shrink(s, n, variance, T, noise):
         s[SLOPE + i] = spread / total
 
 
-@compiled(fastmath=FAST)
+@inlined(fastmath=FAST)
 def weigh(s, n, loss, scale, freedom, cutoff, most, uncertain):
     """Find the robust weights and costs: a loop for each loss, for the logarithm's would be slow for all."""
     for i in range(n):

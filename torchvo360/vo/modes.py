@@ -1,6 +1,7 @@
 """Work handed to other threads, where torch's modes of gradients begin anew."""
 
 from collections.abc import Callable
+from concurrent.futures import Executor, Future
 from typing import ParamSpec, TypeVar
 
 import torch
@@ -18,3 +19,12 @@ def in_present_modes(work: Callable[P, R]) -> Callable[P, R]:
             return work(*args, **kwargs)
 
     return work_likewise
+
+
+def do(worker: Executor | None, work: Callable[[], R]) -> Future[R]:
+    """Let a worker do something in the present modes, after all that it was given before; without one do it at once."""
+    if worker is not None:
+        return worker.submit(in_present_modes(work))
+    done: Future[R] = Future()
+    done.set_result(work())
+    return done

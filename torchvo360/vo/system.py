@@ -9,7 +9,7 @@ once.
 
 import math
 import time
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -34,6 +34,7 @@ from torchvo360.vo.keyframes.cloud import PointCloud
 from torchvo360.vo.keyframes.keyframe import Keyframe, carried_keyframe
 from torchvo360.vo.keyframes.mapper import Mapper
 from torchvo360.vo.loops import LoopCloser, LoopEdge
+from torchvo360.vo.modes import do
 from torchvo360.vo.recover import Recovery
 from torchvo360.vo.sensor import check_depth
 from torchvo360.vo.smooth import smoothed
@@ -134,6 +135,7 @@ class VisualOdometry:
         self._atlas = Atlas()
         self._follower: Follower | None = None
         self._worker = ThreadPoolExecutor(1, "keyframes") if config.overlap else None
+        self._searching: Future[list[LoopEdge]] | None = None
         self._remembered_before, self._cameras_before = 0, self._builder.cameras
         self._lost = 0
 
@@ -161,9 +163,11 @@ class VisualOdometry:
 
     def finish(self) -> OdometryResult:
         """Return all poses and points found so far; more steps may follow."""
-        atlas, loops = self._atlas, list(self._loops.edges)
         if self._follower is not None:
             self._follower.wait()
+        self._take_in_loops()
+        atlas, loops = self._atlas, list(self._loops.edges)
+        if self._follower is not None:
             loops += self._loops.search(self._follower.mapper.references())
         before = atlas.keyframes()
         metric = self._is_metric()
@@ -282,6 +286,8 @@ class VisualOdometry:
             self._atlas.anchor(index, follower.key.frame.index, lie.se3_inverse(T_cam_key))
         if (begun := self._starter.watch(frame, follower.T_map_cam)) is not None:
             follower.take_over()
+            self._close_loops(follower)
+            self._take_in_loops()
             return self._take_over(begun, frame)
         if (metric := follower.mapper.window.metric) is not None:
             self._measured(follower, metric)
@@ -296,10 +302,23 @@ class VisualOdometry:
         return _estimate(frame, T_world_cam, state, reason, found)
 
     def _close_loops(self, follower: Follower) -> bool:
-        """Compare keyframes that have just left the window with the places seen before; whether that joined maps."""
+        """Take in the loops of the keyframes that left the window before; return whether they joined maps.
+
+        The keyframes that have left it since are compared with the places seen before until the next ones leave it.
+        """
         left, follower.left = follower.left, []
-        joined = [self._atlas.join(edge) for key in left for edge in self._loops.add(key)]
-        return any(joined)
+        if not left:
+            return False
+        joined = self._take_in_loops()
+        self._searching = do(self._worker, lambda: [edge for key in left for edge in self._loops.add(key)])
+        return joined
+
+    def _take_in_loops(self) -> bool:
+        """Wait for loops that are being looked for, and join the maps that they connect; return whether any were."""
+        if self._searching is None:
+            return False
+        edges, self._searching = self._searching.result(), None
+        return any([self._atlas.join(edge) for edge in edges])  # noqa: C419  all of them, not the first
 
     def _measured(self, follower: Follower, metric: Metric) -> None:
         """Take in what the IMU says of the present map: its scale, unless that is known otherwise."""
@@ -323,6 +342,7 @@ class VisualOdometry:
     def _lose(self, follower: Follower, frame: PyramidFrame) -> FrameEstimate:
         follower.take_over()
         self._close_loops(follower)
+        self._take_in_loops()
         if self._starter.settling and not follower.mapper.settled:
             # The network misjudged its first keyframes: the corners have to do without.
             self._forget_map()

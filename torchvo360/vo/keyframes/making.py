@@ -10,7 +10,7 @@ from typing import NamedTuple
 from torchvo360.vo.frame import PyramidFrame
 from torchvo360.vo.keyframes.keyframe import Keyframe
 from torchvo360.vo.keyframes.mapper import Mapper
-from torchvo360.vo.modes import in_present_modes
+from torchvo360.vo.modes import do
 from torchvo360.vo.track import Track
 
 
@@ -46,10 +46,6 @@ def begin(mapper: Mapper, frames: int, worker: Executor | None) -> Making:
     Args:
         mapper: The map, whose newest keyframe is meant.
         frames: After how many frames the result takes over.
-        worker: Who does it, in the caller's modes of gradients; None to do it at once.
+        worker: Who does it; None to do it at once.
     """
-    if worker is None:
-        done: Future[Made] = Future()
-        done.set_result(make(mapper))
-        return Making(done, frames)
-    return Making(worker.submit(in_present_modes(make), mapper), frames)
+    return Making(do(worker, lambda: make(mapper)), frames)

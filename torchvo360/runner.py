@@ -2,6 +2,7 @@
 
 import itertools
 import signal
+import sys
 import threading
 import time
 from collections import Counter
@@ -16,7 +17,7 @@ from jaxtyping import Int64
 from torch import Tensor, nn
 from tqdm import tqdm
 
-from torchvo360.backends import backend
+from torchvo360.backends import backend, numba, use_numba
 from torchvo360.checks import InputError
 from torchvo360.data import Frame, Trajectory
 from torchvo360.data.prefetch import prefetched
@@ -32,6 +33,7 @@ from torchvo360.viz.report.page import picture_budget
 from torchvo360.viz.report.pictures import Pictures
 from torchvo360.vo import LEARNED, VisualOdometry
 
+COMPILING = "torchvo360: compiling, which takes a minute and happens once; backend=eager does without."
 NOT_COUPLED = (
     "it told rotations at most, neither scale nor gravity: the camera moved too little or for less than about two "
     "seconds, or the samples' unit, their clock or T_cam_imu is not what was said."
@@ -109,6 +111,8 @@ def run(config: RunConfig, *, config_yaml: str = "") -> Outcome:
         StopSignals() as stop,
         live_view(config.viz, folder / RECORDING, sequence.name, sequence.camera) as live,
     ):
+        if use_numba() and not numba.is_compiled():
+            print(COMPILING, file=sys.stderr)
         depth = None if depth is None else depth.to(config.device)
         odometry = VisualOdometry(
             sequence.camera,

@@ -11,7 +11,8 @@ from jaxtyping import Float, Float64
 from torch import Tensor
 
 from torchvo360.backends import use_numba
-from torchvo360.backends.numba.linearize import intrinsics_of, kernel, loss_of, optics_of
+from torchvo360.backends.numba.kernel import kernel
+from torchvo360.backends.numba.linearize import intrinsics_of, loss_of, optics_of
 from torchvo360.cameras import Equirectangular, Pinhole
 from torchvo360.residuals.direct import Target
 from torchvo360.window.config import WindowConfig

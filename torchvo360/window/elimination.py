@@ -8,7 +8,7 @@ from jaxtyping import Float64
 from torch import Tensor
 
 from torchvo360.backends import use_numba
-from torchvo360.backends.numba.linearize import kernel
+from torchvo360.backends.numba.kernel import kernel
 from torchvo360.solve import schur
 from torchvo360.solve.schur import Reduced
 

@@ -6,7 +6,7 @@ from torch import Tensor
 
 from torchvo360 import lie
 from torchvo360.backends import use_numba
-from torchvo360.backends.numba.linearize import kernel
+from torchvo360.backends.numba.kernel import kernel
 
 
 def move_poses(T: Float64[Tensor, "K 4 4"], xi: Float64[Tensor, "K 6"]) -> Float64[Tensor, "K 4 4"]:

@@ -1,7 +1,8 @@
 """The hot kernel as one compiled pass: `linearize` for float32 on the CPU without gradients; needs the extra `fast`."""
 
 from torchvo360.backends.numba.comparison import brightness_moments, compare, explained_energy
-from torchvo360.backends.numba.linearize import kernel, linearize, serves
+from torchvo360.backends.numba.kernel import is_compiled, kernel
+from torchvo360.backends.numba.linearize import linearize, serves
 from torchvo360.backends.numba.solve import Outcomes, Rules, Solved, solve_pairs
 
 __all__ = [
@@ -11,6 +12,7 @@ __all__ = [
     "brightness_moments",
     "compare",
     "explained_energy",
+    "is_compiled",
     "kernel",
     "linearize",
     "serves",

@@ -1,7 +1,6 @@
 """`linearize` on the compiled pass: tensors to arrays, and sums to normal equations."""
 
 import functools
-import importlib
 import math
 from typing import Any
 
@@ -10,6 +9,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from torchvo360.backends.numba.kernel import kernel
 from torchvo360.cameras import Equirectangular, Pinhole
 from torchvo360.checks import InputError, ShapeError, check_shape
 from torchvo360.residuals.direct import Reference, Target
@@ -158,15 +158,3 @@ def _check_shapes(reference: Reference, target: Target, T_tgt_ref: Tensor, affin
             raise ShapeError(f"{name}: expected shape {[B, *shape]}, got {list(value.shape)}.")
     if affine.shape[0] != B:
         raise ShapeError(f"affine: expected shape {[B, 2]}, got {list(affine.shape)}.")
-
-
-def kernel(name: str) -> Any:
-    """Import a module of what numba has compiled: half a second, and some more the first time of all."""
-    try:
-        return importlib.import_module(f"torchvo360.backends.numba.kernels.{name}")
-    except ModuleNotFoundError as error:
-        if error.name != "numba":
-            raise
-        raise InputError(
-            "linearize: expected numba to be installed (pip install 'torchvo360[fast]'), got none."
-        ) from error

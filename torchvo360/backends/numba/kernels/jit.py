@@ -41,3 +41,8 @@ def inlined(**options: Any) -> Callable[[Callable[..., Any]], Callable[..., Any]
         options: Of `numba.njit`, besides.
     """
     return njit(error_model="numpy", forceinline=True, **options)
+
+
+def is_on_disk(kernel: Any) -> bool:
+    """Return whether a compiled function was kept, in its present state."""
+    return bool(kernel._cache._cache_file._load_index())

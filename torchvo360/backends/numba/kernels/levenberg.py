@@ -85,7 +85,7 @@ def go_on(b, first, sums, prior, state, candidate, scale, free, rules, outcomes)
 
 
 @compiled()
-def _one_by_one(points, images, k, optics, loss, prior, per_radian, state, candidate, free, rules, outcomes):
+def solve_one_by_one(points, images, k, optics, loss, prior, per_radian, state, candidate, free, rules, outcomes):
     """Solve pair after pair."""
     T, affine = candidate[0], candidate[1]
     B, N = len(T), points[1].shape[1]
@@ -103,7 +103,7 @@ def _one_by_one(points, images, k, optics, loss, prior, per_radian, state, candi
 
 
 @compiled()
-def _in_step(workers, points, images, k, optics, loss, prior, per_radian, state, candidate, free, rules, outcomes):
+def solve_in_step(workers, points, images, k, optics, loss, prior, per_radian, state, candidate, free, rules, outcomes):
     """Evaluate all pairs that have not ended together, in threads, step by step."""
     T, affine = candidate[0], candidate[1]
     B, parts = len(T), max((points[1].shape[1] + PART - 1) // PART, 1)
@@ -169,12 +169,12 @@ def solve_pairs(
     arguments = points, images, k, optics, loss, prior, per_radian, state, candidate, free, rules, outcomes
     workers = min(threads, B * parts)
     if workers <= 1:
-        _one_by_one(*arguments)
+        solve_one_by_one(*arguments)
     else:
         before = get_num_threads()
         set_num_threads(min(workers, before))
         try:
-            _in_step(workers, *arguments)
+            solve_in_step(workers, *arguments)
         finally:
             set_num_threads(before)
     return state[0], state[1], equations, status, steps

@@ -100,9 +100,12 @@ class Equirectangular(Camera):
         z: Float[Tensor, "*batch"],
         k: Intrinsics | None = None,
     ) -> tuple[Float[Tensor, "*batch"], Float[Tensor, "*batch"], Float[Tensor, "*batch"]]:
-        horizontal2 = torch.addcmul(x * x, z, z).add_(AXIS_SHIFT**2)
-        lon, minus_lat = torch.atan2(x, z + AXIS_SHIFT), torch.atan2(y, horizontal2.sqrt())
-        return *self._pixel_of_angles(lon, minus_lat, k), torch.addcmul(horizontal2, y, y).rsqrt_()
+        x2 = x * x
+        horizontal = torch.addcmul(x2, z, z).add_(AXIS_SHIFT**2).sqrt_()
+        lon, minus_lat = torch.atan2(x, z + AXIS_SHIFT), torch.atan2(y, horizontal)
+        # In the order of `scale_of`: what a turn of the camera cannot change comes out as zero, not as rounding.
+        inv_scale = torch.addcmul(torch.addcmul(x2, y, y), z, z).add_(AXIS_SHIFT**2).sqrt_().reciprocal_()
+        return *self._pixel_of_angles(lon, minus_lat, k), inv_scale
 
     def _pixel_of_angles(
         self, lon: Float[Tensor, "*batch"], minus_lat: Float[Tensor, "*batch"], k: Intrinsics | None

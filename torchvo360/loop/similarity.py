@@ -230,9 +230,7 @@ def solve_similarity(
 def _serves(pair: LevelPair, *float64: Tensor) -> bool:
     """Return whether the compiled solve takes these points and images, and starts."""
     ways = ((pair.points_a, pair.image_b), (pair.points_b, pair.image_a))
-    return use_numba(*float64) and all(
-        pairs.serves(*way, *float64) and way[0].rho.numel() > 0 for way in ways
-    )
+    return use_numba(*float64) and all(pairs.serves(*way, *float64) and way[0].rho.numel() > 0 for way in ways)
 
 
 def _is_sensible(state: tuple[Tensor, ...]) -> Bool[Tensor, "K"]:

@@ -101,14 +101,19 @@ def _solve(
     """Estimate rotations and brightness of points at infinity: compiled where it serves, else in steps of torch."""
     free = torch.tensor(ROTATION_AND_BRIGHTNESS, device=T_tgt_ref.device)
     if pairs.serves(points, images, T_tgt_ref, affine):
-        limits = {"max_translation": math.inf, "max_log_gain": MAX_LOG_GAIN}
         return pairs.solve(
-            *(points, images, T_tgt_ref, affine, loss, config),
+            points,
+            images,
+            T_tgt_ref,
+            affine,
+            loss,
+            config,
             noise=1.0,
             free=free,
             min_weight=1.0,
             prior=None,
-            **limits,
+            max_translation=math.inf,
+            max_log_gain=MAX_LOG_GAIN,
         )
 
     def evaluate(state: tuple[Tensor, ...], active: Tensor) -> NormalEquations:
@@ -123,9 +128,7 @@ def _solve(
     per_radian = 1 / images.camera.pixel_angle
     scale = affine.new_tensor([0.0] * 3 + [per_radian] * 3 + [1.0] * 2).expand(len(affine), -1)
     start = (T_tgt_ref, affine)
-    return minimize(
-        evaluate, retract, start, config, step_scale=scale, free=free, min_weight=1.0, sensible=is_sensible
-    )
+    return minimize(evaluate, retract, start, config, step_scale=scale, free=free, min_weight=1.0, sensible=is_sensible)
 
 
 def search_rotation(

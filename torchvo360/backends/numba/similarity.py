@@ -100,4 +100,5 @@ def solve_similarities(
     numbers = torch.from_numpy(rows)
     H, g = numbers[:, : D * D].view(-1, D, D), numbers[:, D * D : D * D + D]
     equations = NormalEquations(H, g, *numbers[:, D * D + D :].unbind(1))
-    return SolvedSimilarities(*(torch.from_numpy(part) for part in (S, ab)), equations, *map(torch.from_numpy, (status, steps)))
+    S, ab, status, steps = (torch.from_numpy(part) for part in (S, ab, status, steps))
+    return SolvedSimilarities(S, ab, equations, status, steps)

@@ -1,4 +1,4 @@
-"""Similarities on arrays: exponential, inverse, the rigid motions that they stand for, and how their steps carry over."""
+"""Similarities on arrays: exponential, inverse, their rigid motions, and how a step of one moves its inverse."""
 
 import math
 

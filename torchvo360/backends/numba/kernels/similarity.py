@@ -83,9 +83,7 @@ def _evaluate(s, index, S, affine, frames, k, optics, precision, ranges, row):
     for way in range(2):
         points, images, loss, compared, near = frames[way]
         own = affine[2 * way : 2 * way + 2].reshape(1, 2)
-        sum_part(
-            s, index, 0, 0, len(points[1][0]), points, images, motion[way : way + 1], own, k, optics, loss, sums
-        )
+        sum_part(s, index, 0, 0, len(points[1][0]), points, images, motion[way : way + 1], own, k, optics, loss, sums)
         unfold(sums, M)
         if way == 1:
             step_of_inverse(S_way[1], 1.0 / scale, J)

@@ -9,8 +9,8 @@ from jaxtyping import Float
 from test_numba import CAMERAS, FULL, PLANE, Problem, everything, plain
 from torch import Tensor
 
-from torchvo360 import lie
-from torchvo360.alignment import AlignConfig, PosePrior, compiled, solve_level
+from torchvo360 import lie, pairs
+from torchvo360.alignment import AlignConfig, PosePrior, solve_level
 from torchvo360.backends import backend
 from torchvo360.residuals.direct import Reference, Target
 from torchvo360.residuals.weights import LossConfig
@@ -33,10 +33,10 @@ def solved(
     problem: Problem, config: AlignConfig = CONFIG, *, max_steps: int = 30, prior: PosePrior | None = None, **options
 ) -> tuple[Solution, Solution]:
     """Return the compiled call's solution, and that of `minimize` over the compiled sums."""
-    assert compiled.serves(problem[0], problem[1], problem[2], problem[3], *(prior or ()))
+    assert pairs.serves(problem[0], problem[1], problem[2], problem[3], *(prior or ()))
     found = solve_level(*problem, config, max_steps=max_steps, prior=prior, **options)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(compiled, "serves", lambda *_: False)
+        patch.setattr(pairs, "serves", lambda *_: False)
         return found, solve_level(*problem, config, max_steps=max_steps, prior=prior, **options)
 
 
@@ -186,12 +186,12 @@ def test_no_points_and_no_pairs_are_answered():
 def test_what_it_does_not_serve_is_left_to_minimize():
     problem: tuple[Reference, Target, Float[Tensor, "B 4 4"], Tensor] = plain(near(everything(FULL, 1, 1)))
     reference, target, T, affine = problem
-    assert compiled.serves(*problem)
-    assert not compiled.serves(*problem[:2], T.float(), affine)
-    assert not compiled.serves(*problem[:2], T.clone().requires_grad_(), affine)
-    assert not compiled.serves(reference, replace(target, padded=target.padded.double()), T, affine)
+    assert pairs.serves(*problem)
+    assert not pairs.serves(*problem[:2], T.float(), affine)
+    assert not pairs.serves(*problem[:2], T.clone().requires_grad_(), affine)
+    assert not pairs.serves(reference, replace(target, padded=target.padded.double()), T, affine)
     with backend("eager"):
-        assert not compiled.serves(*problem)
+        assert not pairs.serves(*problem)
         eager = solve_level(*problem, CONFIG, max_steps=30)
     found = solve_level(*problem, CONFIG, max_steps=30)
     assert names(found) == names(eager)

@@ -1,4 +1,4 @@
-"""Alignment at one resolution: compiled where it serves (`compiled`), else in steps of torch."""
+"""Alignment at one resolution: compiled where it serves (`pairs`), else in steps of torch."""
 
 from __future__ import annotations
 
@@ -10,8 +10,7 @@ import torch.nn.functional as F
 from jaxtyping import Bool, Float, Float64
 from torch import Tensor
 
-from torchvo360 import lie
-from torchvo360.alignment import compiled
+from torchvo360 import lie, pairs
 from torchvo360.alignment.config import AlignConfig
 from torchvo360.backends import linearize
 from torchvo360.residuals.direct import Reference, Target
@@ -109,15 +108,17 @@ def solve_level(
     """
     B = T_tgt_ref.shape[0]
     free = free_parameters(config, T_tgt_ref.device) if free is None else free
-    if not traced and compiled.serves(reference, target, T_tgt_ref, affine, *(prior or ())):
-        return compiled.solve(
+    if not traced and pairs.serves(reference, target, T_tgt_ref, affine, *(prior or ())):
+        return pairs.solve(
             reference,
             target,
             T_tgt_ref,
             affine,
-            config,
-            max_steps=max_steps,
+            config.loss,
+            replace(config.solver, max_steps=max_steps),
+            noise=config.noise,
             free=free,
+            min_weight=config.min_pixels,
             prior=prior,
             max_translation=MAX_TRANSLATION,
             max_log_gain=MAX_LOG_GAIN,

@@ -22,11 +22,11 @@ import torch
 from jaxtyping import Bool, Float, Float64, Int64
 from torch import Tensor
 
-from torchvo360 import lie
+from torchvo360 import lie, pairs
 from torchvo360.agreement import agreeing_share
 from torchvo360.alignment import AlignConfig
-from torchvo360.backends import linearize
-from torchvo360.loop.ranges import RangePairs, RangePoints, pair_ranges
+from torchvo360.backends import linearize, numba, use_numba
+from torchvo360.loop.ranges import MIN_RANGE_SIGMA, NEAR_RAD, SLOPE, RangePairs, RangePoints, pair_ranges
 from torchvo360.residuals.direct import Reference, Target
 from torchvo360.residuals.normal import NormalEquations
 from torchvo360.residuals.weights import LossConfig, robust
@@ -71,6 +71,17 @@ class LevelPair:
         """All of A's and B's, and those of A and B that are compared."""
         a, b = (_range_points(points) for points in (self.points_a, self.points_b))
         return a, b, a.thinned(self.range_points), b.thinned(self.range_points)
+
+    @cached_property
+    def compiled(self) -> tuple[numba.OneWay, numba.OneWay]:
+        """Return A into B and B into A as the compiled solve takes them."""
+        a, b, some_a, some_b = self._range_points
+        near_a, near_b = (numba.range_arrays(*points, ordered=True) for points in (a, b))
+        compared_a, compared_b = (numba.range_arrays(*points, ordered=False) for points in (some_a, some_b))
+        return (
+            numba.OneWay(self.points_a, self.image_b, compared_a, near_b),
+            numba.OneWay(self.points_b, self.image_a, compared_b, near_a),
+        )
 
 
 def _range_points(points: Reference) -> RangePoints:
@@ -183,24 +194,43 @@ def solve_similarity(
         The solution, whose state is (S_b_a, affine).
     """
 
+    per_radian = 1 / pair.image_b.camera.pixel_angle
+    scale = [float(pair.points_b.rho.mean()) * per_radian] * 3 + [per_radian] * 4 + [1.0] * 4
+    solver = replace(config.solver, max_steps=max_steps)
+    if _serves(pair, S_b_a, affine):
+        solved = numba.solve_similarities(
+            *(pair.compiled, S_b_a, affine, config.loss),
+            noise=config.noise,
+            ranges=(NEAR_RAD, SLOPE, MIN_RANGE_SIGMA**2, RANGE_LOSS.degrees_of_freedom),
+            scale=scale,
+            rules=pairs.rules_of(solver, config.min_pixels, MAX_TRANSLATION, MAX_LOG_GAIN),
+            limits=(MAX_STEP, MAX_SCALE),
+            outcomes=pairs.OUTCOMES,
+        )
+        return Solution((solved.S_b_a, solved.affine), solved.equations, solved.status, solved.steps)
+
     def evaluate(state: tuple[Tensor, ...], _: Int64[Tensor, "A"]) -> NormalEquations:
         return linearize_similarity(pair, state[0], state[1], config.loss, config.noise)
 
     def retract(state: tuple[Tensor, ...], delta: Float[Tensor, "A 11"]) -> tuple[Tensor, ...]:
         return lie.sim3_exp(delta[:, :7].clamp(-MAX_STEP, MAX_STEP)) @ state[0], state[1] + delta[:, 7:]
 
-    per_radian = 1 / pair.image_b.camera.pixel_angle
-    scale = [float(pair.points_b.rho.mean()) * per_radian] * 3 + [per_radian] * 4 + [1.0] * 4
     return minimize(
         evaluate,
         retract,
         (S_b_a, affine),
-        replace(config.solver, max_steps=max_steps),
+        solver,
         step_scale=S_b_a.new_tensor(scale).expand(S_b_a.shape[0], -1),
         free=torch.ones(11, dtype=torch.bool, device=S_b_a.device),
         min_weight=config.min_pixels,
         sensible=_is_sensible,
     )
+
+
+def _serves(pair: LevelPair, *float64: Tensor) -> bool:
+    """Return whether the compiled solve takes these points and images, and starts."""
+    ways = ((pair.points_a, pair.image_b), (pair.points_b, pair.image_a))
+    return use_numba(*float64) and all(pairs.serves(*way, *float64) and way[0].rho.numel() > 0 for way in ways)
 
 
 def _is_sensible(state: tuple[Tensor, ...]) -> Bool[Tensor, "K"]:

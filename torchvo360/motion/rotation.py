@@ -3,16 +3,17 @@
 At 64 x 32 pixels the whole group costs one batched look-up of about a thousand rotations; the best few are refined.
 """
 
+import functools
 import math
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Float64
 from torch import Tensor
 
-from torchvo360 import lie
+from torchvo360 import lie, pairs
 from torchvo360.agreement import agreeing_share
-from torchvo360.backends import linearize
+from torchvo360.backends import linearize, numba, use_numba
 from torchvo360.image import sample
 from torchvo360.residuals.direct import Reference, Target
 from torchvo360.residuals.normal import NormalEquations
@@ -24,6 +25,8 @@ REFINED = 6
 """Candidates of the global search that are refined."""
 SCORED_POINTS = 500
 """Points of the reference, evenly thinned, by which the grid's rotations are ranked."""
+MAX_LOG_GAIN = 10.0
+"""Exposures differ by less than e to this power."""
 
 
 @dataclass(frozen=True)
@@ -38,6 +41,7 @@ class RotationResult:
     """Share of the gradient that is matched to within half a pixel, 0 to 1."""
 
 
+@functools.lru_cache(maxsize=4)
 def rotation_grid(step_rad: float) -> Float[Tensor, "M 3 3"]:
     """Cover SO(3): every rotation is within about `step_rad` of one of these.
 
@@ -76,32 +80,55 @@ def align_rotation(
     """
     K = R_tgt_ref.shape[0]
     loss = LossConfig() if loss is None else loss
-    points = Reference(reference.ray, torch.zeros_like(reference.rho), reference.value, reference.weight)
+    points = Reference(reference.ray, torch.zeros_like(reference.rho), reference.value, reference.weight).repeated(K)
+    images = target.repeated(K)
+    T, affine = lie.se3(R_tgt_ref, R_tgt_ref.new_zeros(K, 3)), R_tgt_ref.new_zeros(K, 2)
+    solution = _solve(points, images, T, affine, loss, LMConfig(max_steps=max_steps, cost_tolerance=1e-4))
+    cost = solution.equations.cost / solution.equations.weight.clamp_min(1e-9)
+    order = cost.argsort(stable=True)
+    T, affine = (part[order] for part in solution.state)
+    return RotationResult(T[:, :3, :3], affine, cost[order], agreeing_share(points, images, T, affine))
+
+
+def _solve(
+    points: Reference,
+    images: Target,
+    T_tgt_ref: Float64[Tensor, "K 4 4"],
+    affine: Float64[Tensor, "K 2"],
+    loss: LossConfig,
+    config: LMConfig,
+) -> Solution:
+    """Estimate rotations and brightness of points at infinity: compiled where it serves, else in steps of torch."""
+    free = torch.tensor(ROTATION_AND_BRIGHTNESS, device=T_tgt_ref.device)
+    if pairs.serves(points, images, T_tgt_ref, affine):
+        return pairs.solve(
+            points,
+            images,
+            T_tgt_ref,
+            affine,
+            loss,
+            config,
+            noise=1.0,
+            free=free,
+            min_weight=1.0,
+            prior=None,
+            max_translation=math.inf,
+            max_log_gain=MAX_LOG_GAIN,
+        )
 
     def evaluate(state: tuple[Tensor, ...], active: Tensor) -> NormalEquations:
-        T, affine = state
-        return linearize(points.repeated(len(active)), target.repeated(len(active)), T, affine, loss)
+        return linearize(points.take(active), images.take(active), *state, loss)
 
     def retract(state: tuple[Tensor, ...], delta: Tensor) -> tuple[Tensor, ...]:
         return lie.se3_exp(delta[:, :6]) @ state[0], state[1] + delta[:, 6:]
 
-    free = torch.tensor(ROTATION_AND_BRIGHTNESS, device=R_tgt_ref.device)
-    scale = torch.full((K, 8), 1 / target.camera.pixel_angle, dtype=torch.float64, device=R_tgt_ref.device)
-    solution: Solution = minimize(
-        evaluate,
-        retract,
-        (lie.se3(R_tgt_ref, R_tgt_ref.new_zeros(K, 3)), R_tgt_ref.new_zeros(K, 2)),
-        LMConfig(max_steps=max_steps, cost_tolerance=1e-4),
-        step_scale=scale * free,
-        free=free,
-        min_weight=1.0,
-    )
-    cost = solution.equations.cost / solution.equations.weight.clamp_min(1e-9)
-    order = cost.argsort(stable=True)
-    T, affine = (part[order] for part in solution.state)
-    return RotationResult(
-        T[:, :3, :3], affine, cost[order], agreeing_share(points.repeated(K), target.repeated(K), T, affine)
-    )
+    def is_sensible(state: tuple[Tensor, ...]) -> Tensor:
+        return state[1][:, 0].abs() < MAX_LOG_GAIN
+
+    per_radian = 1 / images.camera.pixel_angle
+    scale = affine.new_tensor([0.0] * 3 + [per_radian] * 3 + [1.0] * 2).expand(len(affine), -1)
+    start = (T_tgt_ref, affine)
+    return minimize(evaluate, retract, start, config, step_scale=scale, free=free, min_weight=1.0, sensible=is_sensible)
 
 
 def search_rotation(
@@ -121,21 +148,27 @@ def search_rotation(
         grid: Rotations R_tgt_ref to try, for instance `rotation_grid(0.43)`.
         refined: How many of the best are refined.
     """
-    dtype = reference.value.dtype
-    stride = max(1, reference.rho.shape[1] // SCORED_POINTS)
-    directions = torch.einsum("mij,jn->mni", grid.to(dtype), reference.ray[0, :, ::stride])
-    inside = target.padded[..., 1:-1, 1:-1]
-    value = sample(inside, target.camera.pixel(directions).flatten(0, 1)[None], target.camera)[0, 0]
-    value = value.view(grid.shape[0], -1)
-    weight = reference.weight[:, ::stride]
-    weight = weight / weight.sum().clamp_min(1e-9)
-    known = reference.value[0, :1, ::stride]
-    centred = known - (weight * known).sum()
-    value = value - (weight * value).sum(-1, keepdim=True)
-    spread = (weight * value.square()).sum(-1) * (weight * centred.square()).sum()
-    correlation = (weight * value * centred).sum(-1) / spread.clamp_min(1e-12).sqrt()
-    best = correlation.topk(min(refined, grid.shape[0])).indices
+    best = _correlation(reference, target, grid).topk(min(refined, grid.shape[0])).indices
     return align_rotation(reference, target, grid[best])
+
+
+def _correlation(reference: Reference, target: Target, grid: Float[Tensor, "M 3 3"]) -> Float[Tensor, "M"]:
+    """Return the normalised cross-correlation of some of the reference's points with the target, by rotation."""
+    stride = max(1, reference.rho.shape[1] // SCORED_POINTS)
+    ray, value, weight = (part[..., ::stride] for part in (reference.ray, reference.value, reference.weight))
+    some = Reference(ray, torch.zeros_like(weight), value, weight)
+    T = lie.se3(grid.double(), grid.new_zeros(len(grid), 3).double())
+    if target.camera.wraps and value.shape[1] == 1 and use_numba(T) and numba.serves(some, target, T, T):
+        return numba.correlate_rotations(some, target, T)
+    directions = torch.einsum("mij,jn->mni", grid.to(value), ray[0])
+    inside = target.padded[..., 1:-1, 1:-1]
+    found = sample(inside, target.camera.pixel(directions).flatten(0, 1)[None], target.camera)[0, 0]
+    found = found.view(grid.shape[0], -1)
+    weight = weight / weight.sum().clamp_min(1e-9)
+    centred = value[0, :1] - (weight * value[0, :1]).sum()
+    found = found - (weight * found).sum(-1, keepdim=True)
+    spread = (weight * found.square()).sum(-1) * (weight * centred.square()).sum()
+    return (weight * found * centred).sum(-1) / spread.clamp_min(1e-12).sqrt()
 
 
 def fit_rotation(

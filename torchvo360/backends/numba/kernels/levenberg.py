@@ -12,7 +12,10 @@ from torchvo360.backends.numba.kernels.jit import FAST, compiled, inlined
 from torchvo360.backends.numba.kernels.pairs import PART, SUMS, element, sum_in_threads, sum_part
 from torchvo360.backends.numba.kernels.rigid import se3_log, times_inverse
 from torchvo360.backends.numba.kernels.scratch import BLOCK, SCRATCH, f4
-from torchvo360.backends.numba.kernels.steps import COST, EQUATIONS, SQUARE, WEIGHT, G, begin, find_candidate, judge
+from torchvo360.backends.numba.kernels.steps import begin, find_candidate, judge, places
+
+EQUATIONS = 75
+"""Numbers of a pair's normal equations of (v, w, a, b)."""
 
 
 @inlined(fastmath=FAST)
@@ -51,13 +54,14 @@ def add_up(sums, b, T, prior, row):
         for m in range(SUMS):
             total[m] += sums[part, m]
     m = 0
+    at_g, at_cost, at_weight, at_square = places(8)
     for p in range(8):
         for q in range(p, 8):
             row[p * 8 + q] = row[q * 8 + p] = total[m]
             m += 1
-        row[G + p] = total[m]
+        row[at_g + p] = total[m]
         m += 1
-    row[SQUARE], row[COST], row[WEIGHT] = total[44], total[45], total[46]
+    row[at_square], row[at_cost], row[at_weight] = total[44], total[45], total[46]
     T_prior, information = prior
     if information.size:
         known = element(information, b)
@@ -67,8 +71,8 @@ def add_up(sums, b, T, prior, row):
             for q in range(6):
                 pull += known[p, q] * d[q]
                 row[p * 8 + q] += known[p, q]
-            row[G + p] += pull
-            row[COST] += 0.5 * d[p] * pull
+            row[at_g + p] += pull
+            row[at_cost] += 0.5 * d[p] * pull
 
 
 @inlined()
@@ -78,7 +82,7 @@ def go_on(b, first, sums, prior, state, candidate, scale, free, rules, outcomes)
     if first:
         for m in range(EQUATIONS):
             state[2][b, m] = candidate[2][b, m]
-        going = begin(b, state, rules, outcomes)
+        going = begin(b, state, free, rules, outcomes)
     else:
         going = judge(b, not first, state, candidate, free, rules, outcomes)
     return going and find_candidate(b, state, candidate, scale, free, rules, outcomes)

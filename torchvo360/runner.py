@@ -111,7 +111,7 @@ def run(config: RunConfig, *, config_yaml: str = "") -> Outcome:
         StopSignals() as stop,
         live_view(config.viz, folder / RECORDING, sequence.name, sequence.camera) as live,
     ):
-        if use_numba() and not numba.is_compiled():
+        if config.progress and sys.stderr.isatty() and use_numba() and not numba.is_compiled():
             print(COMPILING, file=sys.stderr)
         depth = None if depth is None else depth.to(config.device)
         odometry = VisualOdometry(

@@ -21,6 +21,9 @@ from torchvo360.vo.track import Track, judge_points, track
 
 LEAST_IN_VIEW = 0.7
 """A keyframe that has fewer of its points in view is followed by one without parallax, where a frame tells ranges."""
+LEAST_CARRIED = 0.5
+"""A new keyframe that shows less than this share of the points tracked so far does not wait for its own: the camera has
+turned away, or the map is young."""
 DISCARDED = -1.0
 """Points of this score or less when a keyframe is made leave the map."""
 CLEARLY = 0.15
@@ -217,17 +220,20 @@ class Follower:
         b = b + (float(found.affine[0].exp()) - 1) * newest.affine[1]
         mapper.discard(self.key.points.score <= DISCARDED)
         mapper.begin_keyframe(frame, T_new_old @ newest.T_cam_world, torch.stack([a, b]))
-        frames = math.floor(self.config.map.lag * self.age)
+        waiting, frames = mapper.reference(), math.floor(self.config.map.lag * self.age)
         # What takes part in every prediction cannot wait: an IMU's states, estimated intrinsics.
-        if self.foresight.imu is not None or self.config.window.calibrate or frames == 0:
+        at_once = self.foresight.imu is not None or self.config.window.calibrate or frames == 0
+        if at_once or self._trusted(waiting) < LEAST_CARRIED * self._trusted(self.key):
             self.key, self.left = make(mapper)
         else:
-            self.key = mapper.reference()
-            self.making = begin(mapper, frames, self.worker)
+            self.key, self.making = waiting, begin(mapper, frames, self.worker)
         # What was bridged stays where it is, against the keyframe that is now the newest.
         self.bridged = {index: T @ lie.se3_inverse(T_new_old) for index, T in self.bridged.items()}
         self.T_cam_key, self.affine, self.age = _identity(), _no_change(), 0
         self.foresight.rekeyed(T_new_old, self.median_rho())
+
+    def _trusted(self, key: Keyframe) -> int:
+        return int(key.trusted(self.config.map.max_relative_variance).sum())
 
     def wait(self) -> None:
         """Wait until the mapper is at rest; what it makes still takes over at its time."""

@@ -73,7 +73,7 @@ def _all_pixels(target: Target) -> Reference:
 
 def _median_scale(pair: LevelPair, R_b_a: Float64[Tensor, "K 3 3"]) -> Float64[Tensor, "K"]:
     """Return the scale that makes the ranges of neighbouring points equal, as if the cameras stood at one place."""
-    forward, _ = pair.ranges(lie.se3(R_b_a, R_b_a.new_zeros(len(R_b_a), 3)))
+    forward = pair.ranges_forward(lie.se3(R_b_a, R_b_a.new_zeros(len(R_b_a), 3)))
     # A scale s divides the moved rho: what is too large by a factor needs that factor.
     difference = forward.difference.masked_fill(forward.weight == 0, torch.nan)
     return difference.nanmedian(-1).values.nan_to_num(nan=0.0).double().clamp(-5, 5).exp()

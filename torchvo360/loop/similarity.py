@@ -58,13 +58,18 @@ class LevelPair:
         S_a_b = lie.sim3_inverse(S_b_a)
         return self.ranges_both_ways(S_b_a, S_a_b, -lie.sim3_adjoint(S_a_b))
 
+    def ranges_forward(self, S_b_a: Float64[Tensor, "K 4 4"]) -> RangePairs:
+        """Return the comparison of A's points in B."""
+        _, b, some_a, _ = self._range_points
+        return pair_ranges(some_a, b, S_b_a)
+
     def ranges_both_ways(
         self, S_b_a: Float64[Tensor, "K 4 4"], S_a_b: Float64[Tensor, "K 4 4"], J_back: Float64[Tensor, "K 7 7"]
     ) -> tuple[RangePairs, RangePairs]:
         """Return what `ranges` does, given the inverse and its step by one of S_b_a, -Ad(S_a_b)."""
-        a, b, some_a, some_b = self._range_points
+        a, _, _, some_b = self._range_points
         backward = pair_ranges(some_b, a, S_a_b)
-        return pair_ranges(some_a, b, S_b_a), backward._replace(J=backward.J @ J_back.to(backward.J))
+        return self.ranges_forward(S_b_a), backward._replace(J=backward.J @ J_back.to(backward.J))
 
     @cached_property
     def _range_points(self) -> tuple[RangePoints, RangePoints, RangePoints, RangePoints]:

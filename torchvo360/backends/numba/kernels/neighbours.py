@@ -22,26 +22,18 @@ def first_above(values, limit):
 
 
 @inlined(fastmath=FAST)
-def multiply_rays(ray, first, last, x, y, z, product):
-    """Write the products of some rays with another."""
-    for j in range(np.uint64(last - first)):
-        at = np.uint64(first) + j
-        product[j] = ray[0, at] * x + ray[1, at] * y + ray[2, at] * z
-
-
-@inlined()
-def find_nearest(ray, first, last, x, y, z, product):
+def find_nearest(ray, first, last, x, y, z):
     """Return which of some rays has the largest product with another, or -1."""
-    multiply_rays(ray, first, last, x, y, z, product)
     best, at = f4(-2), -1
-    for j in range(last - first):
-        if product[j] > best:
-            best, at = product[j], first + j
+    for j in range(first, last):
+        product = ray[0, j] * x + ray[1, j] * y + ray[2, j] * z
+        if product > best:
+            best, at = product, j
     return at
 
 
 @inlined()
-def compare_point(S, ray, rho, near_ray, limit, product):
+def compare_point(S, ray, rho, near_ray, limit):
     """Move a point; return its ray, its inverse range, the nearest of the others within a chord or -1, and the chord.
 
     Rays no farther apart than that differ by less in their heights: only a band of the others is searched.
@@ -52,7 +44,7 @@ def compare_point(S, ray, rho, near_ray, limit, product):
     length = max(math.sqrt(x * x + y * y + z * z), 1e-12)
     x, y, z = x / length, y / length, z / length
     first, last = first_above(near_ray[1], y - 1.01 * limit), first_above(near_ray[1], y + 1.01 * limit)
-    at, chord = find_nearest(near_ray, first, last, f4(x), f4(y), f4(z), product), 2.0
+    at, chord = find_nearest(near_ray, first, last, f4(x), f4(y), f4(z)), 2.0
     if at >= 0:
         chord = math.sqrt((x - near_ray[0, at]) ** 2 + (y - near_ray[1, at]) ** 2 + (z - near_ray[2, at]) ** 2)
     return x, y, z, rho / length, at if chord < limit else -1, chord
@@ -72,12 +64,12 @@ def sum_ranges(S, points, near, settings, M):
     ray, rho, relative = points
     near_ray, near_rho, near_relative = near
     limit, slope, least, freedom = settings
-    row, product, cost, count = np.empty(5), np.empty(len(near_rho), f4), 0.0, 0
+    row, cost, count = np.empty(5), 0.0, 0
     for p in range(5):
         for q in range(5):
             M[p, q] = 0.0
     for i in range(len(rho)):
-        x, y, z, moved_rho, at, chord = compare_point(S, ray[:, i], rho[i], near_ray, limit, product)
+        x, y, z, moved_rho, at, chord = compare_point(S, ray[:, i], rho[i], near_ray, limit)
         if at < 0:
             continue
         difference = math.log(moved_rho / near_rho[at])

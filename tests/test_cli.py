@@ -583,7 +583,7 @@ def test_a_signal_ends_the_run_and_keeps_what_was_done():
         while not Path(name).exists():
             assert process.poll() is None
             time.sleep(0.05)
-    time.sleep(0.7)  # some frames
+    time.sleep(3)  # some frames, once the compiled passes are loaded
     for name, process in processes.items():
         process.send_signal(getattr(signal, name))
     for name, process in processes.items():

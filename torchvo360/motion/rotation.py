@@ -117,7 +117,8 @@ def _solve(
         )
 
     def evaluate(state: tuple[Tensor, ...], active: Tensor) -> NormalEquations:
-        return linearize(points.take(active), images.take(active), *state, loss)
+        T, affine = state
+        return linearize(points.take(active), images.take(active), T, affine, loss)
 
     def retract(state: tuple[Tensor, ...], delta: Tensor) -> tuple[Tensor, ...]:
         return lie.se3_exp(delta[:, :6]) @ state[0], state[1] + delta[:, 6:]

@@ -172,6 +172,6 @@ def solve_similarities(
     equations, proposed = np.empty((2, K, EQUATIONS))
     state = S.copy(), affine.copy(), equations, np.empty((K, 2)), status, steps
     candidate = S.copy(), affine.copy(), proposed, np.empty((K, D))
-    scale = np.ascontiguousarray(np.broadcast_to(scale, (K, D)))
+    scale = np.tile(scale, (K, 1))
     _solve(frames, k, optics, noise**-2, ranges, state, candidate, scale, np.ones(D), rules, limits, outcomes)
     return state[0], state[1], equations, status, steps

@@ -242,7 +242,7 @@ class RunConfig:
     """Threads to compute with: small operations gain little from more; null leaves it to PyTorch and OpenCV."""
     backend: str = "auto"
     """What computes on the CPU: numba where it is installed (auto), eager torch alone, numba or else nothing, or
-    compiled, which is auto with the alignment of images by torch.compile: it needs a C++ compiler and half a minute."""
+    compiled, which is eager with `linearize` by torch.compile: it needs a C++ compiler and half a minute."""
     device: str = "cpu"
     """cpu or cuda."""
     out: str | None = None

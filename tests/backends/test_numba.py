@@ -1,9 +1,11 @@
 """The compiled pass means what the eager kernel means: in every option, at hard points, whatever the threads."""
 
 import math
+import os
 import subprocess
 import sys
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
 import torch
@@ -233,7 +235,7 @@ def test_without_numba_it_names_the_extra_and_selection_does_without(monkeypatch
     select.linearize(*problem, HUBER)
     monkeypatch.setitem(sys.modules, "numba", None)
     monkeypatch.delitem(sys.modules, "torchvo360.backends.numba.kernels.pairs", raising=False)
-    with pytest.raises(InputError, match=r"^linearize: expected numba .*torchvo360\[fast\]"):
+    with pytest.raises(InputError, match=r"^backend: expected numba .*torchvo360\[fast\]"):
         linearize(*problem, HUBER)
 
 
@@ -247,3 +249,23 @@ def test_numba_is_imported_by_its_first_call_alone_and_leaves_torchs_threads():
             assert torch.get_num_threads() == threads
     """
     subprocess.run([sys.executable, "-c", code], check=True, timeout=100)
+
+
+def test_what_is_compiled_now_and_what_was_compiled_before_give_the_same_bits(tmp_path):
+    code = """if True:
+        import hashlib, torch
+        from tests.backends.test_numba import FULL, HUBER, everything, plain
+        from torchvo360.backends.numba import linearize
+        found = linearize(*plain(everything(FULL, 1, 1)), HUBER)
+        print(hashlib.sha256(b"".join(part.contiguous().numpy().tobytes() for part in found)).hexdigest())
+    """
+    environment = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path)}
+    root = Path(__file__).parents[2]
+    runs = [
+        subprocess.run(
+            [sys.executable, "-c", code], check=True, timeout=200, env=environment, cwd=root, capture_output=True
+        )
+        for _ in range(2)
+    ]
+    assert any(tmp_path.rglob("*.nbc"))
+    assert runs[0].stdout == runs[1].stdout

@@ -69,8 +69,11 @@ _kept = _Kept()
 
 
 def serves(reference: Reference, target: Target, T_tgt_ref: Tensor, affine: Tensor) -> bool:
-    """Return whether buffers may be written to: on the CPU, where nobody asks for a derivative."""
+    """Return whether buffers may be written to: on the CPU, of one type, where nobody asks for a derivative."""
     if in_transform() or reference.rho.device.type != "cpu":
+        return False
+    numbers = (reference.ray, reference.rho, reference.weight, reference.variance, target.padded, target.confidence)
+    if any(x is not None and x.dtype != reference.value.dtype for x in numbers):
         return False
     inputs = (reference.ray, reference.rho, reference.value, reference.weight, reference.variance, T_tgt_ref, affine)
     images = (target.padded, target.confidence, target.intrinsics)

@@ -18,20 +18,16 @@ def blur(image: Float[Tensor, "*batch H W"], camera: Camera, sigma_px: float) ->
     """Smooth by a Gaussian of `sigma_px` pixels, around the seam and over the poles; 0 leaves the image as it is."""
     if sigma_px <= 0:
         return image
+    from kornia.filters import get_gaussian_kernel1d  # here: a run of the odometry starts faster without
+
     radius = blur_radius(sigma_px)
-    kernel = _gaussian(radius, sigma_px, image)
+    kernel = get_gaussian_kernel1d(2 * radius + 1, sigma_px, dtype=image.dtype, device=image.device)[0]
     padded = pad_image(image, camera, radius).reshape(-1, 1, camera.height + 2 * radius, camera.width + 2 * radius)
     alone = len(padded) == 1 and padded.numel() < SMALL_PLANE
     # A small image alone takes another path in torch, and comes out with other last digits: let it have company.
     vertical = F.conv2d(padded.expand(2, -1, -1, -1) if alone else padded, kernel.reshape(1, 1, -1, 1))
     smooth = F.conv2d(vertical, kernel.reshape(1, 1, 1, -1))
     return (smooth[:1] if alone else smooth).reshape(image.shape)
-
-
-def _gaussian(radius: int, sigma_px: float, like: Tensor) -> Float[Tensor, "taps"]:
-    """Return weights of sum 1 from -radius to radius."""
-    weight = torch.exp(-torch.arange(-radius, radius + 1).to(like).square() / (2 * sigma_px**2))
-    return weight / weight.sum()
 
 
 def blur_radius(sigma_px: float) -> int:

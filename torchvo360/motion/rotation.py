@@ -42,6 +42,7 @@ class RotationResult:
 
 
 @functools.lru_cache(maxsize=4)
+@torch.inference_mode(False)
 def rotation_grid(step_rad: float) -> Float[Tensor, "M 3 3"]:
     """Cover SO(3): every rotation is within about `step_rad` of one of these.
 

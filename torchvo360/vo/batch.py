@@ -16,7 +16,7 @@ R = TypeVar("R")
 
 
 class OdometryBatch:
-    """Odometries that advance together, in as many threads as there are cores.
+    """Odometries that advance together, in as many threads as there are cores, beside which each looks for loops.
 
     The compiled passes and torch's operations leave Python's lock to the others, so that the throughput grows with the
     batch until the cores are full. No odometry reads what another one writes: the results are those of single runs, bit

@@ -31,7 +31,8 @@ class OdometryConfig:
     restart_after: int = 15
     """Lost frames in a row after which a new map is started and joined to the old one."""
     overlap: bool = True
-    """Make keyframes in a second thread while the next frames are tracked. The results are the same bits either way."""
+    """Look for loops, and with `map.lag` make keyframes, in a second thread while the next frames are tracked. The
+    results are the same bits either way."""
     smooth: bool = False
     """Smooth the finished trajectory by the filter of the motion, forwards and backwards in time (Rauch, Tung and
     Striebel): every pose as far as its alignment left it open. It takes 3 ms a frame."""

@@ -14,7 +14,7 @@ from torchvo360.vo.config import OdometryConfig
 from torchvo360.vo.foresee import MAX_PREDICTED, Expected, Foresight
 from torchvo360.vo.frame import FrameBuilder, PyramidFrame
 from torchvo360.vo.keyframes.keyframe import Keyframe, KeyPoints
-from torchvo360.vo.keyframes.making import Making, begin, make
+from torchvo360.vo.keyframes.making import Made, Making, begin, make
 from torchvo360.vo.keyframes.mapper import Mapper
 from torchvo360.vo.recover import Recovery
 from torchvo360.vo.track import Track, judge_points, track
@@ -220,11 +220,13 @@ class Follower:
         b = b + (float(found.affine[0].exp()) - 1) * newest.affine[1]
         mapper.discard(self.key.points.score <= DISCARDED)
         mapper.begin_keyframe(frame, T_new_old @ newest.T_cam_world, torch.stack([a, b]))
-        waiting, frames = mapper.reference(), math.floor(self.config.map.lag * self.age)
+        settings = self.config.map
+        frames = math.floor(settings.lag * min(self.age, settings.max_keyframe_gap))
         # What takes part in every prediction cannot wait: an IMU's states, estimated intrinsics.
-        at_once = self.foresight.imu is not None or self.config.window.calibrate or frames == 0
-        if at_once or self._trusted(waiting) < LEAST_CARRIED * self._trusted(self.key):
-            self.key, self.left = make(mapper)
+        can_wait = self.foresight.imu is None and not self.config.window.calibrate and frames > 0
+        waiting = mapper.reference() if can_wait else None
+        if waiting is None or self._trusted(waiting) < LEAST_CARRIED * self._trusted(self.key):
+            self._take(make(mapper))
         else:
             self.key, self.making = waiting, begin(mapper, frames, self.worker)
         # What was bridged stays where it is, against the keyframe that is now the newest.
@@ -235,15 +237,23 @@ class Follower:
     def _trusted(self, key: Keyframe) -> int:
         return int(key.trusted(self.config.map.max_relative_variance).sum())
 
-    def wait(self) -> None:
-        """Wait until the mapper is at rest; what it makes still takes over at its time."""
-        if self.making is not None:
-            self.making.work.result()
+    def _take(self, made: Made) -> None:
+        self.key = made.key
+        self.left += made.left
+
+    def wait(self) -> list[Keyframe]:
+        """Wait until the mapper is at rest; what it makes still takes over at its time.
+
+        Returns:
+            The keyframes that will then have left the window.
+        """
+        return [] if self.making is None else self.making.work.result().left
 
     def take_over(self) -> None:
         """Go on against the points of the keyframe in the making, if there is one; wait for it where it must be."""
         if (making := self.making) is None:
             return
-        (self.key, self.left), self.making = making.work.result(), None
+        self.making = None
+        self._take(making.work.result())
         for frame, found in making.tracked:
             self.mapper.observe(frame, found.T_cam_key, found.affine)

@@ -1,4 +1,4 @@
-"""Work handed to other threads, where torch's modes of gradients begin anew."""
+"""Work handed to other threads, where torch's modes of gradients and numbers of threads begin anew."""
 
 from collections.abc import Callable
 from concurrent.futures import Executor, Future
@@ -11,10 +11,12 @@ R = TypeVar("R")
 
 
 def in_present_modes(work: Callable[P, R]) -> Callable[P, R]:
-    """Return a function that works in the present thread's modes of gradients, whatever thread calls it."""
+    """Return a function that works as the present thread does, with and without gradients, whatever thread calls it."""
     inference, gradients = torch.is_inference_mode_enabled(), torch.is_grad_enabled()
+    threads = torch.get_num_threads()
 
     def work_likewise(*args: P.args, **kwargs: P.kwargs) -> R:
+        torch.set_num_threads(threads)  # OpenMP counts them for each thread by itself
         with torch.inference_mode(inference), torch.set_grad_enabled(gradients):
             return work(*args, **kwargs)
 

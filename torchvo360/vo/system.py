@@ -136,6 +136,8 @@ class VisualOdometry:
         self._follower: Follower | None = None
         self._worker = ThreadPoolExecutor(1, "keyframes") if config.overlap else None
         self._searching: Future[list[LoopEdge]] | None = None
+        self._joined = False
+        """Whether maps were joined of which no frame has told yet."""
         self._remembered_before, self._cameras_before = 0, self._builder.cameras
         self._lost = 0
 
@@ -163,12 +165,11 @@ class VisualOdometry:
 
     def finish(self) -> OdometryResult:
         """Return all poses and points found so far; more steps may follow."""
-        if self._follower is not None:
-            self._follower.wait()
-        self._take_in_loops()
+        self._joined |= self._take_in_loops()
         atlas, loops = self._atlas, list(self._loops.edges)
         if self._follower is not None:
-            loops += self._loops.search(self._follower.mapper.references())
+            leaving = self._follower.wait()
+            loops += self._loops.search([*leaving, *self._follower.mapper.references()])
         before = atlas.keyframes()
         metric = self._is_metric()
         after = atlas.corrected(loops, self.config.loop.graph, metric=metric)
@@ -291,7 +292,8 @@ class VisualOdometry:
             return self._take_over(begun, frame)
         if (metric := follower.mapper.window.metric) is not None:
             self._measured(follower, metric)
-        joined = self._close_loops(follower)
+        joined = self._close_loops(follower) or self._joined
+        self._joined = False
         T_world_cam = self._atlas.in_world(follower.T_map_cam)
         was_lost, self._lost = self._lost > 0, 0
         if joined:

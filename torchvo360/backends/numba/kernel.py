@@ -14,7 +14,7 @@ def kernel(name: str) -> Any:
         if error.name != "numba":
             raise
         raise InputError(
-            "linearize: expected numba to be installed (pip install 'torchvo360[fast]'), got none."
+            "backend: expected numba to be installed (pip install 'torchvo360[fast]'), got none."
         ) from error
 
 

@@ -47,6 +47,10 @@ def encoded(image: UInt8[np.ndarray, "H W 3"]) -> bytes:
     return cv2.imencode(".jpg", bgr, [cv2.IMWRITE_JPEG_QUALITY, QUALITY])[1].tobytes()
 
 
+MOST_WAITING = 8
+"""Frames that wait to be encoded; more are waited for."""
+
+
 class Pictures:
     """Collects pictures while frames go by."""
 
@@ -68,7 +72,7 @@ class Pictures:
 
     def add(self, frame: Frame) -> None:
         """Keep the picture of a frame if it is its turn; a frame that cannot be used has none."""
-        self._finish(wait=False)
+        self._finish(wait=len(self._jobs) > MOST_WAITING)
         self._jobs.append(self._worker.submit(self._add, frame))
 
     def _finish(self, *, wait: bool) -> None:

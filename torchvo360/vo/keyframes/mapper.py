@@ -191,9 +191,11 @@ class Mapper:
         self.window.keep_points((points.inliers >= 1) | ((points.information > 0) & self.metric))
 
     def _drop(self, place: int) -> None:
-        frame, points = self.window.drop_frame(place)
-        gone = self.frames.pop(place)
-        self.settled[gone.index] = lie.se3_inverse(frame.T_cam_world)
+        gone = self.frames[place]
+        # First, so that others find it here or there at any time.
+        self.settled[gone.index] = lie.se3_inverse(self.window.frames[place].T_cam_world)
+        _, points = self.window.drop_frame(place)
+        self.frames.pop(place)
         self.clouds[gone.index] = self._cloud(gone, points)
 
     def _cloud(self, frame: PyramidFrame, points: WindowPoints) -> PointCloud:

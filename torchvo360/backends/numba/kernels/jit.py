@@ -1,15 +1,21 @@
 """How kernels are compiled, and when they are compiled again."""
 
+import inspect
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 from numba import njit
 
+from torchvo360.cameras import equirectangular, pinhole
+from torchvo360.residuals import direct
+
 # NaN and infinities stay what they are: they must not get past the comparisons that hold indices inside.
 FAST = {"contract", "reassoc", "arcp", "nsz"}
 
-_SOURCES = sorted(Path(__file__).parent.glob("*.py"))
+# With the modules whose constants the kernels hold.
+_OTHERS = [Path(inspect.getfile(module)) for module in (equirectangular, pinhole, direct)]
+_SOURCES = [*sorted(Path(__file__).parent.glob("*.py")), *_OTHERS]
 _STAMP = tuple((path.name, path.stat().st_mtime_ns, path.stat().st_size) for path in _SOURCES)
 
 

@@ -6,10 +6,9 @@ handed out together. Either way a pair gets the same bits.
 """
 
 import numpy as np
-from numba import get_num_threads, set_num_threads
 
 from torchvo360.backends.numba.kernels.jit import FAST, compiled, inlined
-from torchvo360.backends.numba.kernels.pairs import PART, SUMS, element, sum_in_threads, sum_part
+from torchvo360.backends.numba.kernels.pairs import PART, SUMS, element, in_threads, sum_in_threads, sum_part
 from torchvo360.backends.numba.kernels.rigid import se3_log, times_inverse
 from torchvo360.backends.numba.kernels.scratch import BLOCK, SCRATCH, f4
 from torchvo360.backends.numba.kernels.steps import begin, find_candidate, judge, places
@@ -175,10 +174,6 @@ def solve_pairs(
     if workers <= 1:
         solve_one_by_one(*arguments)
     else:
-        before = get_num_threads()
-        set_num_threads(min(workers, before))
-        try:
+        with in_threads(workers):
             solve_in_step(workers, *arguments)
-        finally:
-            set_num_threads(before)
     return state[0], state[1], equations, status, steps

@@ -7,6 +7,9 @@ The formulas are those of `residuals.direct` and `residuals.weights`, where they
 """
 
 import math
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
 
 import numpy as np
 import torch
@@ -18,6 +21,8 @@ from torchvo360.backends.numba.kernels.lookup import compare, doubt, gather
 from torchvo360.backends.numba.kernels.rows import add_products, add_slopes, build_rows
 from torchvo360.backends.numba.kernels.scratch import BLOCK, NEAREST, PI, PINHOLE, SCRATCH, SPHERE, TWO, f4
 from torchvo360.backends.numba.kernels.weights import shrink, weigh
+
+_STARTING = threading.Lock()
 
 PART = 4096
 """Points of one thread's work, about 20 microseconds: several times what it costs to hand it out."""
@@ -145,13 +150,24 @@ def sum_pairs(
         # Without the threading layer, which takes its time and dies in a process forked from one that has used it.
         _sum_parts(0, 1, *arguments)
     else:
+        with in_threads(workers):
+            sum_in_threads(workers, *arguments)
+    return sums.reshape(B, parts, SUMS).sum(1)
+
+
+@contextmanager
+def in_threads(workers: int) -> Iterator[None]:
+    """Let numba use some threads, at most as many as it is allowed, and one caller at a time.
+
+    The simplest of its threading layers ends the process where two threads of Python start theirs at once.
+    """
+    with _STARTING:
         before = get_num_threads()
         set_num_threads(min(workers, before))
         try:
-            sum_in_threads(workers, *arguments)
+            yield
         finally:
             set_num_threads(before)
-    return sums.reshape(B, parts, SUMS).sum(1)
 
 
 def _start_threads() -> None:

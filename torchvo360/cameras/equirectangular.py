@@ -104,7 +104,7 @@ class Equirectangular(Camera):
         horizontal = torch.addcmul(x2, z, z).add_(AXIS_SHIFT**2).sqrt_()
         lon, minus_lat = torch.atan2(x, z + AXIS_SHIFT), torch.atan2(y, horizontal)
         # In the order of `scale_of`: what a turn of the camera cannot change comes out as zero, not as rounding.
-        inv_scale = torch.addcmul(torch.addcmul(x2, y, y), z, z).add_(AXIS_SHIFT**2).sqrt_().reciprocal_()
+        inv_scale = torch.addcmul(torch.addcmul(x2, y, y), z, z).add_(AXIS_SHIFT**2).sqrt_().reciprocal()
         return *self._pixel_of_angles(lon, minus_lat, k), inv_scale
 
     def _pixel_of_angles(

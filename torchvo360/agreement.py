@@ -49,20 +49,13 @@ def _beyond(share: Float[Tensor, "B"], chance: Float[Tensor, "B"]) -> Float[Tens
     return ((share - chance) / (1 - chance).clamp_min(1e-3)).clamp_min(0.0)
 
 
-def explained_share(found: Comparison) -> Float[Tensor, "B"]:
-    """Return the share of the samples' gradient energy whose residuals are smaller than half a pixel's displacement.
-
-    Residuals are measured by the gradient they stand on: neither exposure, nor contrast, nor smooth areas count. True
-    alignments of real and rendered images reach 0.8 to 0.95; false minima that keep the contrast 0.15 to 0.35.
-
-    Returns:
-        Between 0 and 1; 0 where the images have no gradient or no point is seen.
-    """
-    return _share_of(found.residual, found.weight * found.slope2, found.slope2)
-
-
 def _share_of(
     residual: Float[Tensor, "B C N"], energy: Float[Tensor, "B C N"], slope2: Float[Tensor, "B C N"]
 ) -> Float[Tensor, "B"]:
+    """Return the share of the gradient's energy whose residuals are smaller than half a pixel's displacement.
+
+    Residuals are measured by the gradient they stand on: neither exposure, nor contrast, nor smooth areas count. True
+    alignments of real and rendered images reach 0.8 to 0.95; false minima that keep the contrast 0.15 to 0.35.
+    """
     explained = energy * (residual.square() < TOLERANCE_PX**2 * slope2)
     return explained.sum((1, 2)) / energy.sum((1, 2)).clamp_min(torch.finfo(energy.dtype).tiny)

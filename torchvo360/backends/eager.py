@@ -1,4 +1,4 @@
-"""The hot kernel in eager torch: the default and the reference; autograd flows through it.
+"""The hot kernel in eager torch: the reference, and what computes where numba does not; autograd flows through it.
 
 `linearize` never keeps the Jacobian: rows are built, weighted and contracted chunk by chunk into one 9 x 9 matrix
 `S W S^T` per pair, where the ninth row is the residual. The chunk is small enough for its rows to stay in the cache.

@@ -1,4 +1,4 @@
-"""The hot kernel as one compiled pass: `linearize` for float32 on the CPU without gradients; needs the extra `fast`."""
+"""Hot passes compiled by numba, for float32 on the CPU without gradients; they need the extra `fast`."""
 
 from torchvo360.backends.numba.comparison import brightness_moments, compare, explained_energy
 from torchvo360.backends.numba.correlation import correlate_rotations

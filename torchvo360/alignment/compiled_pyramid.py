@@ -14,6 +14,7 @@ from torchvo360.alignment.inputs import MAX_RHO, Inputs
 from torchvo360.alignment.pyramid import Level, confidence_of, eroded, own_rays, rays_of
 from torchvo360.backends import use_numba
 from torchvo360.backends.numba import kernel
+from torchvo360.backends.numba.arrays import plain
 from torchvo360.cameras import Camera
 from torchvo360.image import blur_radius, level_camera
 from torchvo360.residuals.direct import Reference, Target
@@ -156,4 +157,4 @@ def _make_grids(camera: Camera, levels: int) -> Grids:
 
 
 def _flat(value: Tensor) -> np.ndarray:
-    return value.detach().contiguous().view(-1).numpy()
+    return plain(value).reshape(-1)

@@ -17,7 +17,9 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from torchvo360.backends.numba.images import can_see, image_view, look_up_usable, plain
+from torchvo360.backends.numba.arrays import plain
+from torchvo360.backends.numba.images import can_see, image_view, look_up_usable
+from torchvo360.backends.numba.kernel import kernel
 from torchvo360.checks import InputError, check_finite_number
 from torchvo360.residuals.direct import Target
 
@@ -189,12 +191,10 @@ def _search_compiled(
     affine: Float[Tensor, "2"],
     config: EpipolarConfig,
 ) -> EpipolarMatch:
-    from torchvo360.backends.numba.kernels.epipolar import search
-
     rho, variance = (torch.empty_like(points[1]) for _ in range(2))
     searched, found = (torch.empty_like(rho, dtype=torch.bool) for _ in range(2))
     limits = (config.min_gradient, config.min_sine, config.max_half_width_px, config.max_ssd, config.min_distinction)
-    search(
+    kernel("epipolar").search(
         *(plain(part) for part in (*points, T_tgt_ref.double(), affine.double())),
         image_view(reference),
         image_view(target),

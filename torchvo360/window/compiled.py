@@ -11,8 +11,8 @@ from jaxtyping import Float, Float64
 from torch import Tensor
 
 from torchvo360.backends import use_numba
+from torchvo360.backends.numba.arrays import intrinsics_of, loss_of, optics_of, plain
 from torchvo360.backends.numba.kernel import kernel
-from torchvo360.backends.numba.linearize import intrinsics_of, loss_of, optics_of
 from torchvo360.cameras import Equirectangular, Pinhole
 from torchvo360.residuals.direct import Target
 from torchvo360.window.config import WindowConfig
@@ -59,9 +59,9 @@ def sum_edges(
     kernels = kernel("edges")
     N, P = points.value.shape
     K = len(targets)
-    T, affine = _array(estimate.T_cam_world), _array(estimate.affine)
-    at = NO_POSES if T_first is None else _array(T_first)
-    arrays = (_array(x) for x in (points.ray, estimate.rho, points.value, points.weight, points.host))
+    T, affine = plain(estimate.T_cam_world), plain(estimate.affine)
+    at = NO_POSES if T_first is None else plain(T_first)
+    arrays = (plain(x) for x in (points.ray, estimate.rho, points.value, points.weight, points.host))
     packed, counts = kernels.pack(*arrays, affine)
     sums, means = np.zeros((4, N)), np.empty(N, np.float32)
     cross, M = NO_SUMS
@@ -75,8 +75,8 @@ def sum_edges(
             continue
         if target.camera not in optics:
             optics[target.camera] = intrinsics_of(target)[0], optics_of(target)
-        confidence = NO_IMAGE if target.confidence is None else _array(target.confidence[0, 0])
-        image = _array(target.padded[0, 0]), confidence
+        confidence = NO_IMAGE if target.confidence is None else plain(target.confidence[0, 0])
+        image = plain(target.padded[0, 0]), confidence
         loss = loss_of(config.loss, target.saturation, 0.0)
         outputs = means, sums, cross, M[j] if keyframes else M
         arguments = packed, T, at, affine, image, *optics[target.camera], loss, *outputs
@@ -92,7 +92,3 @@ def sum_edges(
         return of_points, None
     H, g = kernel("normal").assemble(M, T if T_first is None else at, affine)
     return of_points, KeyframeSums(torch.from_numpy(H), torch.from_numpy(g), torch.from_numpy(cross).T)
-
-
-def _array(value: Tensor) -> np.ndarray:
-    return value.detach().contiguous().numpy()

@@ -8,7 +8,9 @@ from jaxtyping import Bool, Float, Int64
 from torch import Tensor
 
 from torchvo360 import lie
-from torchvo360.backends.numba.images import can_see, image_view, look_up_usable, plain
+from torchvo360.backends.numba.arrays import plain
+from torchvo360.backends.numba.images import can_see, image_view, look_up_usable
+from torchvo360.backends.numba.kernel import kernel
 from torchvo360.residuals.direct import Target
 from torchvo360.window.pattern import CENTRE
 from torchvo360.window.points import WindowPoints
@@ -69,11 +71,9 @@ def _project_compiled(
     centre: int,
     max_difference: float,
 ) -> Projected:
-    from torchvo360.backends.numba.kernels.projecting import project
-
     pixel, shown = torch.empty_like(points.host), torch.empty_like(points.host, dtype=torch.bool)
     ray, rho = points.ray.new_empty(3, len(points)), torch.empty_like(points.rho)
-    project(
+    kernel("projecting").project(
         plain(points.ray),
         centre,
         *(plain(part) for part in (points.rho, points.host, points.value, points.weight)),

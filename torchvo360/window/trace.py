@@ -16,7 +16,9 @@ import torch
 from jaxtyping import Bool, Float, Float64
 from torch import Tensor
 
-from torchvo360.backends.numba.images import can_see, image_view, look_up_usable, plain
+from torchvo360.backends.numba.arrays import plain
+from torchvo360.backends.numba.images import can_see, image_view, look_up_usable
+from torchvo360.backends.numba.kernel import kernel
 from torchvo360.checks import InputError, check_finite_number
 from torchvo360.depth.epipolar import HALF_PATTERN, GreatCircles, great_circles, reference_samples
 from torchvo360.residuals.direct import Target
@@ -145,11 +147,9 @@ def _walk(
 def _walk_compiled(
     circles: GreatCircles, samples: Float[Tensor, "N 5"], theta: Float[Tensor, "L"], target: Target, config: TraceConfig
 ) -> tuple[Float[Tensor, "N C"], Bool[Tensor, "N C"]]:
-    from torchvo360.backends.numba.kernels.tracing import walk
-
     count = min(config.candidates, len(theta) - 2 * HALF_PATTERN)
     place, value = (samples.new_empty(len(samples), count) for _ in range(2))
-    walk(
+    kernel("tracing").walk(
         *(plain(part) for part in (circles.start, circles.towards, 0.9 * circles.phi, samples)),
         *(plain(part) for part in (theta, theta.cos(), theta.sin())),
         image_view(target),
@@ -192,12 +192,10 @@ def _pattern_cost(
 def _pattern_cost_compiled(
     points: WindowPoints, rho: Float[Tensor, "N M"], views: list[View], config: TraceConfig
 ) -> Float[Tensor, "N M"]:
-    from torchvo360.backends.numba.kernels.tracing import compare_patterns
-
     worst, sees = torch.zeros_like(rho), torch.zeros_like(rho, dtype=torch.bool)
     arrays = [plain(part) for part in (points.ray, points.value, points.weight, rho)]
     for view in views:
-        compare_patterns(
+        kernel("tracing").compare_patterns(
             *arrays,
             plain(view.T_tgt_host.double()),
             np.float32(math.exp(float(view.affine[0]))),

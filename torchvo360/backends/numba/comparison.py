@@ -8,12 +8,9 @@ from jaxtyping import Float, Float64
 from torch import Tensor
 
 from torchvo360.backends.comparison import Comparison
+from torchvo360.backends.numba.arrays import ANY_LOSS, as_arrays
 from torchvo360.backends.numba.kernel import kernel
-from torchvo360.backends.numba.linearize import as_arrays
 from torchvo360.residuals.direct import Reference, Target
-from torchvo360.residuals.weights import LossConfig
-
-ANY_LOSS = LossConfig()
 
 
 def compare(

@@ -5,12 +5,9 @@ import torch
 from jaxtyping import Float64
 from torch import Tensor
 
+from torchvo360.backends.numba.arrays import ANY_LOSS, NOTHING, as_arrays
 from torchvo360.backends.numba.kernel import kernel
-from torchvo360.backends.numba.linearize import NOTHING, as_arrays
 from torchvo360.residuals.direct import Reference, Target
-from torchvo360.residuals.weights import LossConfig
-
-ANY_LOSS = LossConfig()
 
 
 def correlate_rotations(

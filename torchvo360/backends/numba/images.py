@@ -7,7 +7,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from torchvo360.backends.numba.linearize import optics_of
+from torchvo360.backends.numba.arrays import optics_of, plain
+from torchvo360.backends.numba.kernel import kernel
 from torchvo360.backends.select import use_numba
 from torchvo360.cameras import Equirectangular, Pinhole
 from torchvo360.residuals import direct
@@ -62,13 +63,6 @@ def look_up_value(target: Target, ray: Float[Tensor, "3 *points"]) -> Float[Tens
 
 
 def _look_up(view: ImageView, ray: Float[Tensor, "3 *points"]) -> Float[Tensor, "*points"]:
-    from torchvo360.backends.numba.kernels.sight import see_rays
-
     out = ray.new_empty(ray.shape[1:])
-    see_rays(plain(ray).reshape(3, -1), view, out.numpy().reshape(-1))
+    kernel("sight").see_rays(plain(ray).reshape(3, -1), view, out.numpy().reshape(-1))
     return out
-
-
-def plain(value: Tensor) -> np.ndarray:
-    """Return a contiguous array."""
-    return value.detach().contiguous().numpy()

@@ -9,7 +9,9 @@ import torch
 from jaxtyping import Bool, Float, Int64, UInt8
 from torch import Tensor
 
-from torchvo360.backends.numba.images import can_see, plain
+from torchvo360.backends.numba.arrays import plain
+from torchvo360.backends.numba.images import can_see
+from torchvo360.backends.numba.kernel import kernel
 from torchvo360.backends.select import use_numba
 from torchvo360.cameras import Camera, Pinhole, check_image_size
 from torchvo360.image import gradient_magnitude, pad_image, resample, selection
@@ -30,20 +32,19 @@ def padded_levels(
     margin = max(1, round(3 * blur_px)) if blur_px > 0 else 0
     if device.type != "cpu" or not use_numba() or margin > min(grey.shape):
         return _padded_levels(_smoothed(grey, cameras[0], blur_px, margin).to(device), cameras)
-    from torchvo360.backends.numba.kernels.pictures import edge, halve, smooth
-
+    passes = kernel("pictures")
     taps = cv2.getGaussianKernel(2 * margin + 1, blur_px, cv2.CV_32F)[:, 0] if margin else np.ones(1, np.float32)
     out: list[Tensor] = []
     for camera in cameras:
         padded = torch.empty(1, 1, camera.height + 2, camera.width + 2)
         array = padded.numpy()[0, 0]
         if not out:
-            smooth(np.ascontiguousarray(grey), taps, camera.wraps, array)
+            passes.smooth(np.ascontiguousarray(grey), taps, camera.wraps, array)
         elif out[-1].shape[-2:] == (2 * camera.height + 2, 2 * camera.width + 2):
-            halve(out[-1].numpy()[0, 0], array)
+            passes.halve(out[-1].numpy()[0, 0], array)
         else:
             padded[..., 1:-1, 1:-1] = resample(out[-1][..., 1:-1, 1:-1], camera)
-        edge(array, camera.wraps)
+        passes.edge(array, camera.wraps)
         out.append(padded)
     return out
 
@@ -75,10 +76,8 @@ def gradient_strength(target: Target, rays: Float[Tensor, "H W 3"]) -> Float[Ten
     """
     if not can_see(target):
         return gradient_magnitude(target.padded[0, 0, 1:-1, 1:-1], target.camera, rays)
-    from torchvo360.backends.numba.kernels.pictures import gradient_strength
-
     out = torch.empty(target.camera.height, target.camera.width)
-    gradient_strength(plain(target.padded[0, 0]), *_covector_weights(target.camera), out.numpy())
+    kernel("pictures").gradient_strength(plain(target.padded[0, 0]), *_covector_weights(target.camera), out.numpy())
     return out
 
 
@@ -108,13 +107,11 @@ def select_pixels(
     """Choose the strongest usable pixel of each cell as `image.select_pixels` does."""
     if not use_numba(strength, usable) or strength.dtype != torch.float32 or not minimum > 0:
         return selection.select_pixels(strength, usable, camera, count, minimum=minimum)
-    from torchvo360.backends.numba.kernels.pictures import strongest
-
     check_image_size("strength", strength, camera)
     check_image_size("usable", usable, camera)
     first, cells = selection.equal_area_rows(camera, count)
     total = int((first + cells).max())
     most, pixel = np.full(total, -1, np.int32), torch.full((total,), -1)
     bits = plain(strength).view(np.int32), plain(usable), np.array(minimum, np.float32).view(np.int32)[()]
-    strongest(*bits, first.numpy(), cells.numpy(), most, pixel.numpy())
+    kernel("pictures").strongest(*bits, first.numpy(), cells.numpy(), most, pixel.numpy())
     return pixel[pixel >= 0].sort().values

@@ -7,8 +7,8 @@ import torch
 from jaxtyping import Float, Float64, Int64
 from torch import Tensor
 
+from torchvo360.backends.numba.arrays import as_arrays
 from torchvo360.backends.numba.kernel import kernel
-from torchvo360.backends.numba.linearize import as_arrays
 from torchvo360.backends.numba.solve import Outcomes, Rules
 from torchvo360.residuals.direct import Reference, Target
 from torchvo360.residuals.normal import NormalEquations
